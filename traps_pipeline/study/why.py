@@ -61,9 +61,7 @@ def _judged(workspace: Workspace, cell: Cell, item_id: str) -> Iterator[str]:
 def _rows_of(workspace: Workspace, table: Table, cell: Cell, item_id: str) -> list[dict[str, Any]]:
     if workspace.tables.state(table, cell.partition) is None:
         return []
-    rows = workspace.tables.read(table, cell.partition)
-    mine = rows.loc[rows["item_id"] == item_id].astype(object)
-    return mine.where(mine.notna(), None).to_dict("records")  # a null text is NaN in a frame
+    return [row for row in workspace.tables.records(table, cell.partition) if row["item_id"] == item_id]
 
 
 def _about(row: Mapping[str, Any]) -> Any:
@@ -71,8 +69,10 @@ def _about(row: Mapping[str, Any]) -> Any:
 
 
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
-    items = workspace.tables.read_all(ITEMS, dataset=dataset)
-    return next((item for item in items.to_dict("records") if item["item_id"] == item_id), None)
+    if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
+        return None
+    items = workspace.tables.records(ITEMS, {"dataset": dataset})
+    return next((item for item in items if item["item_id"] == item_id), None)
 
 
 def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
