@@ -10,10 +10,12 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: help demo demo-mechanism check fast-tests test test-newest promises campaign test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages browser test-packages clean environments
+.PHONY: help demo demo-mechanism check fast-tests test promises campaign cluster-setup ui lint setup setup-core docs render-packages browser test-packages clean
 
 help: ## what make can do here
-	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 22
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' Makefile | expand -t 22
+	@printf '\nfor maintainers (maintainers.mk):\n'
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' maintainers.mk | expand -t 22
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -40,19 +42,6 @@ fast-tests: setup
 test: setup browser ## check, and one real path for each promise of the documentation: eight minutes
 	$(MAKE) --no-print-directory -j2 --output-sync=line lint promises
 
-# Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
-test-newest: VENV := .workspaces/newest
-test-newest: BIN := .workspaces/newest/bin
-test-newest: render-packages ## the newest libraries that pyproject.toml admits: what is sent to models, and fast tests
-	rm -rf .workspaces/newest
-	$(make-venv)
-	$(PIP_INSTALL) $(TORCH)
-	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,test,docs]' hatchling
-	$(compile)
-	$(BIN)/python -m pip --disable-pip-version-check list
-	$(BIN)/traps models check
-	$(PYTEST) -n auto $(FAST)
-
 # What is compiled is copied to the checkouts of the tests, whose commands would each compile it again. One worker more
 # than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
 promises: setup
@@ -63,41 +52,11 @@ campaign: test-packages cluster-setup ## everything else, in full or SHARD=2/6 o
 	$(BIN)/python -m compileall -q traps_pipeline
 	$(COMPLETE) $(PYTEST) -n 3 $(CAMPAIGN) $(if $(SHARD),--shard $(SHARD),--write-durations)
 
-# Of these the campaign has a small version (tests/integration/test_cluster.py).
-test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs
-	$(BIN)/python bench/cluster_study.py --kill
-	$(BIN)/python bench/cluster_study.py --mechanism --kill --at hidden_states
-	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
-
-test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
-	$(BIN)/python -m bench.cluster_kills run cap node stopped postgres network head store together
-
-test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
-	$(BIN)/python bench/cluster_gate.py
-
 cluster-setup: test-packages setup $(VENV)/.cluster
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1; open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
 	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/traps ui --port $(PORT)
-
-bench: setup ## ratios against what one would otherwise use; each script has --quick
-	$(BIN)/python bench/render.py
-	$(BIN)/python bench/ledger.py
-	$(BIN)/python bench/calls.py
-	$(BIN)/python bench/throughput.py
-	$(BIN)/python bench/extraction.py
-	$(BIN)/python bench/probes.py
-	$(BIN)/python bench/scoring.py
-	$(BIN)/python bench/shortcuts.py
-	$(BIN)/python bench/explorer.py
-
-bench-cluster: cluster-setup ## what a cluster costs and gains, against one machine; half an hour to an hour
-	$(BIN)/python bench/cluster.py
-
-# For maintainers, after a version in the explorer's package.json was changed; the bundle is checked in.
-explorer-vendor:
-	cd traps_pipeline/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
 
 # With more room for what is new, node searches for garbage less often: an eighth of pyright's time, on a core that tests want.
 lint: export NODE_OPTIONS := $(strip $(NODE_OPTIONS) --max-semi-space-size=64)
@@ -145,19 +104,10 @@ test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 echo '$(PIP)' | $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r /dev/stdin || true
 endef
 
-lock: ## for maintainers: the locks from pyproject.toml, with uv
-	$(PYTHON) tools/lock.py $(LOCK_OPTIONS)
-
-wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same files
-	$(BIN)/python -m hatchling build -t wheel
-
 # The time in pages that have one: any will do, as long as it is the same in every build.
 docs: export SOURCE_DATE_EPOCH ?= 1580601600
 docs: setup ## site/index.html: the documentation with its reference; links, anchors and each page's place are checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
-
-sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
-	$(BIN)/python tools/sbom.py dist/sbom.json
 
 # apt only when something is missing; without root the one line to run is printed.
 render-packages:
@@ -176,14 +126,7 @@ else \
 fi
 endef
 
-# Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.
-ENVIRONMENTS := $(patsubst tests/release/%.txt,.workspaces/environments/%/.installed,$(wildcard tests/release/*.txt))
-PYTHON_eval ?= python3.12
-environments: $(ENVIRONMENTS) ## one file of tests/release, one environment
-.workspaces/environments/%/.installed: tests/release/%.txt
-	$(or $(PYTHON_$*),$(PYTHON)) -m venv $(@D)
-	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
-	touch $@
-
 clean: ## remove the environment; studies under .workspaces stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache
+
+include maintainers.mk

@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests import objectstore
-from tests.forked import FORKS
+from tests.build.commands import traps
 from tests.lacking import lack, need
 from tests.objectstore import S3
 from tests.postgres import LACKING, Postgres, programs
@@ -79,11 +80,14 @@ class Checkout:
         return Finished(process.returncode, out, err)
 
     def python(self, *arguments: str | Path) -> Finished:
-        """Run Python in the checkout, with `-m MODULE` or `-c CODE`, forked from a process that has the libraries."""
-        return Finished(*FORKS.run(arguments, self.root, self.environment))
+        """Run Python in the checkout, with `-m MODULE` or `-c CODE`; a program of the latter prints no warnings."""
+        quiet = ("-W", "ignore") if arguments[0] == "-c" else ()
+        return self.run(sys.executable, *quiet, *arguments)
 
     def traps(self, *arguments: str | Path) -> Finished:
-        """Run a `traps` command."""
+        """Run a `traps` command: in this process, or in one of its own where the checkout is a copy of this one."""
+        if self.root == ROOT:
+            return Finished(*traps([*map(str, arguments)], ROOT, self.environment))
         return self.python("-m", "traps_pipeline.cli", *arguments)
 
     def score(self, experiment: str | Path) -> Finished:
@@ -96,6 +100,7 @@ class Checkout:
 
     def correct(self, scenario_id: str, action: str = "correct", **changes: Any) -> None:
         """Append a review decision."""
+        assert self.root != ROOT, "this would change the checkout that is tested: use own_study"
         decision = {
             "scenario_id": scenario_id,
             "action": action,
@@ -217,8 +222,14 @@ def small_output(small: Checkout) -> str:
     return small.workspace.with_suffix(".out").read_text()
 
 
+def copy_of(source: Checkout, folder: Path) -> Checkout:
+    """A copy of a study; code and data are those of this checkout, so that its commands run in this process."""
+    copy_workspace(source.workspace, folder / "study")
+    return Checkout(ROOT, folder / "study")
+
+
 def copied(source: Checkout, folder: Path) -> Checkout:
-    """A copy of a study in a checkout of its own, to be altered at will."""
+    """A copy of a study in a checkout of its own, whose code and data may be altered, too."""
     root = make_checkout(folder / "checkout")
     shutil.copytree(SMALL.parent, root / "tests" / "experiments")
     copy_workspace(source.workspace, folder / "study")
@@ -227,13 +238,19 @@ def copied(source: Checkout, folder: Path) -> Checkout:
 
 @pytest.fixture
 def study(small: Checkout, tmp_path: Path) -> Checkout:
-    """A copy of the small study; its experiment is `EXPERIMENT`."""
+    """A copy of the small study; its experiment is `EXPERIMENT`. Code and data are those of this checkout."""
+    return copy_of(small, tmp_path)
+
+
+@pytest.fixture
+def own_study(small: Checkout, tmp_path: Path) -> Checkout:
+    """A copy of the small study in a checkout of its own, for a test that alters code, records or registry."""
     return copied(small, tmp_path)
 
 
 @pytest.fixture
 def demo_study(demo: Checkout, tmp_path: Path) -> Checkout:
-    """A copy of the finished demo."""
+    """A copy of the finished demo in a checkout of its own."""
     return copied(demo, tmp_path)
 
 

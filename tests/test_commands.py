@@ -25,17 +25,26 @@ BLOCK = re.compile(r"^```(?:sh|bash|text|)\n(.*?)^```$", re.DOTALL | re.MULTILIN
 LINE = re.compile(r"(?:[A-Z_]+=\S+ )*(?:[\w/]+/)?(traps|make|dagster|inspect|python3?|pip|uv|apt-get) ")
 SPAN = re.compile(r"`((?:traps|make) [^`|]+)`")
 NOT_RUN = (ROOT / "docs" / "ci.md").read_text().partition("## Commands that no test runs")[2].partition("\n## ")[0]
-NOUNS = ("answers", "confabulation", "judges", "ledger", "models", "pocket", "requests", "votes")
-MAKEFILE = {*re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)}
+NOUNS = ("answers", "confabulation", "judges", "ledger", "models", "requests", "votes")
+MAKEFILE = {
+    target
+    for name in ("Makefile", "maintainers.mk")
+    for target in re.findall(r"^([a-z-]+):", (ROOT / name).read_text(), re.MULTILINE)
+}
 TESTS = {path.relative_to(ROOT / "tests").as_posix(): path.read_text() for path in (ROOT / "tests").rglob("*.py")}
 # A test runs these by other words: the file, and the words.
 RUN_AS = {
     "traps votes import": ("integration/test_batches.py", 'study.traps(what, "import"'),
     "inspect eval": ("release/test_pocket_harness.py", '"-m", "inspect_ai", "eval"'),
     "make docs": ("test_docs_site.py", '"make", "-C", checkout'),
+    "make release-check": ("test_habits.py", '"release-check"'),
     "make sbom": ("base/test_extras.py", '"tools/sbom.py"'),
     "make ui": ("integration/test_ui.py", '"ui",'),
     "make wheel": ("test_wheel.py", '"hatchling", "build"'),
+    **{
+        f"tools.pocket {name}": ("pocket/test_pocket.py", f'main(["{name}",')
+        for name in ("render", "train", "evaluate", "card")
+    },
 }
 # `.ci/run` is `make test`, which sets up in a fresh environment and runs what `make check` runs.
 IN_CI = ("venv", "make check", "make setup", "make test", "make help")

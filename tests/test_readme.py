@@ -25,7 +25,7 @@ def blocks(language: str) -> list[str]:
 
 def in_this_study(study: Checkout, command: str) -> str:
     """The command with the study's folders in place of the README's."""
-    command = command.replace("mine.yaml", str(study.root / "mine.yaml")).replace(
+    command = command.replace("mine.yaml", str(study.workspace.parent / "mine.yaml")).replace(
         ".workspaces/mine", str(study.workspace.parent / "mine")
     )
     # The real Makefile of the real checkout, on this study, but no set-up: in a checkout whose environment is another's
@@ -48,7 +48,7 @@ DEAR = re.compile(r"make |sed |traps (sample|certify|run|harness|models check --
 @pytest.mark.promise
 def test_the_commands_of_the_readme_that_render_nothing_run_on_the_golden_study(study: Checkout) -> None:
     (experiment,) = blocks("yaml")
-    (study.root / "mine.yaml").write_text(experiment)
+    (study.workspace.parent / "mine.yaml").write_text(experiment)
     commands = [line for line in "".join(blocks("sh")).splitlines() if not DEAR.match(line)]
     assert len(commands) == 15
     for command in commands:
@@ -65,7 +65,7 @@ def test_every_command_of_the_readme_runs(demo_study: Checkout, provider: Provid
     judges = "".join(f'  - {{id: judge-{k}, base_url: "{provider.url}/v1"}}\n' for k in "abc")
     here = f"judges:\n{judges}panels: {{here: [judge-a, judge-b, judge-c]}}\npanel: here"
     mine = experiment.replace("http://127.0.0.1:8000", provider.url).replace("panel: paper", here)
-    (study.root / "mine.yaml").write_text(mine)
+    (study.workspace.parent / "mine.yaml").write_text(mine)
     (correction,) = blocks("json")
     # The demo's clips serve here too: a clip's name is its content.
     shutil.copytree(study.workspace / "clips", study.workspace.parent / "mine" / "clips")

@@ -18,8 +18,6 @@ from typing import Any
 
 import pytest
 
-from tests.forked import FORKS
-
 DURATIONS = Path(__file__).with_name("durations.json")  # tier to file to CPU seconds, written by the full campaign
 UNKNOWN_S = 5.0  # CPU seconds that a file without a measurement is taken to need
 SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole", "postgres", "s3", "tiny_disk", "small_disk"}
@@ -112,9 +110,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def cpu_s() -> float:
-    """Return the CPU seconds of this process, of its children that have ended, and of forked commands."""
+    """Return the CPU seconds of this process and of its children that have ended."""
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system + FORKS.cpu_s()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 @cache

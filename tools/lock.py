@@ -1,5 +1,7 @@
 """Writes the locks from `pyproject.toml`: `make lock`. Needs uv on the PATH, and a package index.
 
+With `--check` it writes nothing and needs neither: it fails where a lock does not hold what `pyproject.toml` asks.
+
 requirements.lock: everything that `make test` wants, but torch, which comes in builds for CPUs and each kind of GPU.
 requirements-core.lock: what `make demo` wants, a part of it. pylock.toml: the former as PEP 751 has it.
 
@@ -17,6 +19,8 @@ import re
 import subprocess
 import sys
 import tempfile
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +28,7 @@ LOCK, CORE, PYLOCK = (ROOT / name for name in ("requirements.lock", "requirement
 WHEELS = "wheels"
 BUILD = "hatchling\n"  # installs the checkout itself
 TORCH_NEEDS = "filelock\nfsspec\nnetworkx\nsetuptools>=77\nsympy\n"
+UNLOCKED = ("sign", "cluster")  # the latter has a lock of its own
 WITHOUT_TORCH = 'torch; sys_platform == "never"\n'
 
 
@@ -49,9 +54,32 @@ def without_addresses(pylock: str) -> str:
     return pylock
 
 
+def outdated(project: Path = ROOT / "pyproject.toml", lock: Path = LOCK) -> Iterator[str]:
+    """Yield a sentence for each requirement that the lock's version of it does not meet, or that the lock lacks.
+
+    What is in no lock is not looked at: torch, and the extras `sign` and `cluster`.
+    """
+    from packaging.requirements import Requirement
+
+    table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+    extras = table["optional-dependencies"]
+    pins = dict(re.findall(r"^([\w.-]+)(?:\[.*?\])?==([^ ;]+)", lock.read_text(encoding="utf-8"), re.MULTILINE))
+    wanted = [*table["dependencies"], *(line for name in extras if name not in UNLOCKED for line in extras[name])]
+    for requirement in map(Requirement, wanted):
+        name = re.sub(r"[-_.]+", "-", requirement.name).lower()
+        if name in (table["name"], "torch"):
+            continue
+        if name not in pins:
+            yield f"{lock.name}: lacks {requirement}, which {project.name} asks; run `make lock`"
+        elif not requirement.specifier.contains(pins[name], prereleases=True):
+            yield f"{lock.name}: has {name} {pins[name]}, but {project.name} asks {requirement}; run `make lock`"
+
+
 def main() -> None:
     """Write all three. Versions that are locked stay, unless `--upgrade` is among the arguments."""
     more = sys.argv[1:]
+    if more == ["--check"]:
+        sys.exit("\n".join(outdated()) or None)
     everything = ("--extra", "all", "--extra", "dev", "--extra", "docs")
     compile_lock(LOCK, BUILD + TORCH_NEEDS, *everything, "--generate-hashes", *more)
     compile_lock(CORE, BUILD, "--constraints", LOCK, "--generate-hashes", *more)

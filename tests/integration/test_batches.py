@@ -12,7 +12,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import KEY, SECRET, SMALL, Checkout, copied, forget_answers
+from tests.conftest import KEY, SECRET, SMALL, Checkout, copy_of, forget_answers
 from tests.providers.server import Provider
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
@@ -29,7 +29,7 @@ SERVED = {"openai": "seer", "gemini": "gemini-3-flash-preview", "anthropic": "cl
 OF_THE_CALL = ("created_at", "attempts", "latency_s", "cost_usd")
 
 
-def experiment(root: Path, url: str) -> Path:
+def experiment(folder: Path, url: str) -> Path:
     """Three models and three judges, each over another API, on the small study's scenarios."""
     price = "prices: {input: 1, output: 10, as_of: 2026-11-01}"
     accounts, models, judges = "", "", ""
@@ -41,7 +41,7 @@ def experiment(root: Path, url: str) -> Path:
         media = "media: {profile: images, fps: 5, most: 25}"
         models += f"  - {{id: model-{route}, {asked}, {media}, {sampling}}}\n"
         judges += f"  - {{id: judge-{route}, {asked}, params: {{temperature: 0.8, max_tokens: 512}}}}\n"
-    path = root / "batched.yaml"
+    path = folder / "batched.yaml"
     path.write_text(
         f"name: batched\naccounts:\n{accounts}models:\n{models}judges:\n{judges}"
         f"panels: {{three: [{', '.join(f'judge-{route}' for route in ROUTES)}]}}\npanel: three\nbudget_usd: 100\n"
@@ -98,13 +98,12 @@ def table(study: Checkout, which: Table[Any]) -> pd.DataFrame:
 def test_answers_and_votes_through_files_alone_make_the_tables_of_the_live_path(
     unasked: Checkout, small: Checkout, provider: Provider, tmp_path: Path
 ) -> None:
-    batched = forget_answers(copied(small, tmp_path / "batched"))
-    path = experiment(unasked.root, provider.url)
+    batched = forget_answers(copy_of(small, tmp_path / "batched"))
+    path = experiment(tmp_path, provider.url)
     live = unasked.traps("run", path, "--panel", "three", "--no-preflight", "--until", "leaderboard")
     assert live.code == 0, live.err
     calls = provider.stats()["requests"]
 
-    path = experiment(batched.root, provider.url)
     assert batched.traps("init", path, "--panel", "three").code == 0
     through_files(batched, path, "answers", provider.url, tmp_path / "requests")
     answers = batched.traps("run", path, "--no-preflight", "--until", "responses")

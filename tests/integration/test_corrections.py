@@ -19,6 +19,14 @@ from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def study(own_study: Checkout) -> Checkout:
+    """A study whose records the tests correct."""
+    return own_study
+
+
 EVALUATIONS = 3 * 2 * 1  # models x regimes x runs of the small study
 
 # Dagster's own verdict on every partition, by the resolver behind its UI, once sources are observed as sensors do it.

@@ -35,42 +35,46 @@ def edit_record(study: Checkout, file: str, line: int, **changes: object) -> Pat
     return path
 
 
-def test_a_malformed_spec_names_file_and_line(study: Checkout) -> None:
-    path = study.root / "scene_specs" / "released" / "plinko.jsonl"
+def test_a_malformed_spec_names_file_and_line(own_study: Checkout) -> None:
+    path = own_study.root / "scene_specs" / "released" / "plinko.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], lines[1][:50], *lines[2:]]) + "\n")
-    assert_refused(study.traps("run", EXPERIMENT), f"{path}:2", "restore the line from git")
+    assert_refused(own_study.traps("run", EXPERIMENT), f"{path}:2", "restore the line from git")
 
 
-def test_an_unknown_family_is_answered_with_the_known_ones(study: Checkout) -> None:
-    path = edit_record(study, "plinko", 1, family="plonko")
-    assert_refused(study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, domino_count")
-
-
-def test_a_duplicate_scenario_names_the_second_line(study: Checkout) -> None:
-    path = edit_record(study, "plinko", 2, scenario_id="plinko-0001")
-    assert_refused(study.traps("run", EXPERIMENT), f"{path}:2", "'plinko-0001' occurs twice")
-
-
-def test_a_label_outside_the_closed_set_is_refused(study: Checkout) -> None:
-    study.correct("domino_chain-0001", answer="maybe")
-    where = study.root / "scene_specs" / "corrections" / "review.jsonl"
-    assert_refused(study.traps("run", EXPERIMENT), f"{where}:1", "'maybe' is not one of the labels ['yes', 'no']")
-
-
-def test_a_correction_of_an_unknown_scenario_names_its_line(study: Checkout) -> None:
-    study.correct("domino_chain-0001", action="keep")
-    study.correct("domino_chain-0777", question="Who?")
-    where = study.root / "scene_specs" / "corrections" / "review.jsonl"
-    assert_refused(study.traps("run", EXPERIMENT), f"{where}:2", "'domino_chain-0777' is unknown")
-
-
-def test_an_altered_trajectory_is_noticed(study: Checkout) -> None:
-    folder = study.root / "scene_specs" / "released" / "trajectories"
-    (folder / "plinko-0001.npz").write_bytes((folder / "plinko-0002.npz").read_bytes())
-    study.correct("plinko-0003", ill_posed_question="How heavy is the moon in the picture?")  # makes the category stale
+def test_an_unknown_family_is_answered_with_the_known_ones(own_study: Checkout) -> None:
+    path = edit_record(own_study, "plinko", 1, family="plonko")
     assert_refused(
-        study.traps("run", EXPERIMENT), "plinko-0001.npz", "is not the record's", "restore the file from git"
+        own_study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, domino_count"
+    )
+
+
+def test_a_duplicate_scenario_names_the_second_line(own_study: Checkout) -> None:
+    path = edit_record(own_study, "plinko", 2, scenario_id="plinko-0001")
+    assert_refused(own_study.traps("run", EXPERIMENT), f"{path}:2", "'plinko-0001' occurs twice")
+
+
+def test_a_label_outside_the_closed_set_is_refused(own_study: Checkout) -> None:
+    own_study.correct("domino_chain-0001", answer="maybe")
+    where = own_study.root / "scene_specs" / "corrections" / "review.jsonl"
+    assert_refused(own_study.traps("run", EXPERIMENT), f"{where}:1", "'maybe' is not one of the labels ['yes', 'no']")
+
+
+def test_a_correction_of_an_unknown_scenario_names_its_line(own_study: Checkout) -> None:
+    own_study.correct("domino_chain-0001", action="keep")
+    own_study.correct("domino_chain-0777", question="Who?")
+    where = own_study.root / "scene_specs" / "corrections" / "review.jsonl"
+    assert_refused(own_study.traps("run", EXPERIMENT), f"{where}:2", "'domino_chain-0777' is unknown")
+
+
+def test_an_altered_trajectory_is_noticed(own_study: Checkout) -> None:
+    folder = own_study.root / "scene_specs" / "released" / "trajectories"
+    (folder / "plinko-0001.npz").write_bytes((folder / "plinko-0002.npz").read_bytes())
+    own_study.correct(
+        "plinko-0003", ill_posed_question="How heavy is the moon in the picture?"
+    )  # makes the category stale
+    assert_refused(
+        own_study.traps("run", EXPERIMENT), "plinko-0001.npz", "is not the record's", "restore the file from git"
     )
 
 
@@ -162,7 +166,7 @@ def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Chec
     assert kept
     filler.unlink()
     # Tables made so far are whole; the rest follows with room for it.
-    more = study.root.parent / "ledger"
+    more = study.workspace.parent / "ledger"
     subprocess.run(["cp", "-r", f"{small_disk}/.", more], check=True)
     ledger.unlink()
     ledger.symlink_to(more, target_is_directory=True)

@@ -13,13 +13,21 @@ import pytest
 
 from bench.equality import main as compare
 from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
-from tests.conftest import Checkout, copy_workspace
+from tests.conftest import Checkout, copy_workspace, forget_answers
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 from tests.storage.conftest import VARIABLE
 from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def unasked(own_study: Checkout) -> Checkout:
+    """A study without answers whose registry the tests change."""
+    return forget_answers(own_study)
+
+
 WANTED = 2 * ITEMS
 
 

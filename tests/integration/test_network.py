@@ -14,11 +14,19 @@ from pathlib import Path
 import pytest
 
 from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
-from tests.conftest import SECRET, Checkout
+from tests.conftest import SECRET, Checkout, forget_answers
 from tests.providers.server import Provider
 from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def unasked(own_study: Checkout) -> Checkout:
+    """A study without answers whose registry the tests change."""
+    return forget_answers(own_study)
+
+
 MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 288 and of 192, and five kills: for a release
 TRANSIENT = {
     "rate_limited": 0.03,
@@ -248,7 +256,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     ("line", "complaint"),
     [
         ("not json", "not JSON"),
-        ('{"key": "k", "text": "x", "mood": 1}', "mood: Extra inputs"),
+        ('{"key": "k", "text": "x", "mood": 1}', "mood: "),
         ('{"key": "k", "outcome": "error"}', "an error is no answer"),
         ('{"key": "k", "outcome": "answer", "text": " "}', "outcome 'answer' needs a text"),
         ('{"key": "k", "outcome": "refused", "text": "no"}', "outcome 'refused' must have no text"),

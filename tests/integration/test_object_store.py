@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +14,6 @@ import pytest
 
 from bench.equality import main as compare
 from tests.conftest import ROOT, SMALL, Checkout, Finished
-from tests.forked import FORKS
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.storage.objects import ObjectStore
@@ -35,7 +36,9 @@ class Host:
     def traps(self, *arguments: str | Path) -> Finished:
         own = {"TRAPS_WORKSPACE": ADDRESS, "TRAPS_SCRATCH": str(self.scratch), "PYTHONPATH": str(ROOT)}
         environment = {name: value for name, value in os.environ.items() if name != "DAGSTER_HOME"} | own
-        return Finished(*FORKS.run(["-m", "traps_pipeline.cli", *arguments], ROOT, environment))
+        command = [sys.executable, "-m", "traps_pipeline.cli", *map(str, arguments)]
+        finished = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        return Finished(finished.returncode, finished.stdout, finished.stderr)
 
     @property
     def root(self) -> Path:

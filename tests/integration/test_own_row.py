@@ -20,7 +20,7 @@ def experiment(study: Checkout, url: str, panel: str) -> Path:
     """Two models and three judges at a server, in four lines each or fewer."""
     judges = "".join(f'  - {{id: judge-{k}, base_url: "{url}/v1"}}\n' for k in "abc")
     scenarios = SMALL.read_text()[SMALL.read_text().index("scenarios:") :]
-    path = study.root / "own.yaml"
+    path = study.workspace.parent / "own.yaml"
     path.write_text(
         "name: own\nmodels:\n"
         f'  - {{id: seer, base_url: "{url}/v1", served_name: org/Seer-7B, media: images}}\n'

@@ -16,6 +16,14 @@ from tests.conftest import EXPERIMENT, Checkout, Finished
 from tests.integration.test_errors import edit_record
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def study(own_study: Checkout) -> Checkout:
+    """A study whose records the tests correct."""
+    return own_study
+
+
 CELL = "occlusion|oracle__json__run1"
 FILE = "occlusion/oracle/json/1.parquet"
 

@@ -14,6 +14,14 @@ from tests.integration.listening import a_browser, listening, ready, watched
 from tests.pages import until
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def study(own_study: Checkout) -> Checkout:
+    """A study whose records the tests correct."""
+    return own_study
+
+
 ILL_POSED = (
     "Is the balloon to the left or to the right of the wall?"  # of another plinko: the check proves it without looking
 )

@@ -20,7 +20,7 @@ def test_the_pocket_model_behind_transformers_serve_gets_a_row(
     unasked: Checkout, provider: Provider, tmp_path: Path
 ) -> None:
     judges = "".join(f'  - {{id: judge-{k}, base_url: "{provider.url}/v1"}}\n' for k in "abc")
-    path = unasked.root / "served.yaml"
+    path = tmp_path / "served.yaml"
     with transformers_serve(WEIGHTS, tmp_path) as url:
         path.write_text(
             f"name: served\nmodels:\n  - id: served\n    base_url: {url}\n    served_name: {WEIGHTS}\n"

@@ -98,21 +98,21 @@ def test_a_range_of_cells_is_one_run_through_three_stages_and_makes_exactly_its_
     assert finished.code == 0, finished.err[-3000:]
 
 
-def test_one_command_makes_all_that_the_study_asks_and_fails_with_what_it_could_not(study: Checkout) -> None:
-    before = known(study)["versions"]
-    forget_answers(study)
-    finished = execute(study, "everything")
+def test_one_command_makes_all_that_the_study_asks_and_fails_with_what_it_could_not(own_study: Checkout) -> None:
+    before = known(own_study)["versions"]
+    forget_answers(own_study)
+    finished = execute(own_study, "everything")
     assert finished.code == 0, finished.err[-3000:]
-    assert known(study)["versions"] == before
+    assert known(own_study)["versions"] == before
     question = {"ill_posed_question": "What does the triangle at the bottom weigh?"}
-    study.correct("plinko-0002", **question)
-    asked = len(study.ledger_rows("answers"))
-    assert execute(study, "everything").code == 0  # a correction is one command
-    assert len(study.ledger_rows("answers")) == asked + 3 * 2
-    damaged = Workspace.open(study.workspace).tables.path(VERDICTS, {**_partition(CELL)})
-    (study.root / "scene_specs" / "released" / "plinko.jsonl").write_text("{}\n")
+    own_study.correct("plinko-0002", **question)
+    asked = len(own_study.ledger_rows("answers"))
+    assert execute(own_study, "everything").code == 0  # a correction is one command
+    assert len(own_study.ledger_rows("answers")) == asked + 3 * 2
+    damaged = Workspace.open(own_study.workspace).tables.path(VERDICTS, {**_partition(CELL)})
+    (own_study.root / "scene_specs" / "released" / "plinko.jsonl").write_text("{}\n")
     damaged.unlink()
-    finished = execute(study, "everything")
+    finished = execute(own_study, "everything")
     assert finished.code == 1
     assert "plinko.jsonl:1" in finished.out + finished.err
 
@@ -149,21 +149,21 @@ def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout)
     assert sum(name.startswith("responses/") for name in known(study)["versions"]) == 4 * 3 * 2
 
 
-def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(study: Checkout) -> None:
-    path = study.root / "traps_pipeline" / "defs" / "scoring.py"
+def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(own_study: Checkout) -> None:
+    path = own_study.root / "traps_pipeline" / "defs" / "scoring.py"
     stages = path.read_text()
     before, place, after = stages.partition('    needs={"verdicts": "some"},')
     old = re.search(r'    code="(\d+)",\n$', before)  # of the stage metrics, which stands just above
     assert place and old is not None
     path.write_text(f'{before[: old.start()]}    code="99",\n{place}{after}')
-    status = study.traps("status", EXPERIMENT).out
+    status = own_study.traps("status", EXPERIMENT).out
     assert f"its code has version 99 now, it was made by version {old[1]}" in status
-    run = study.score(EXPERIMENT)
+    run = own_study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "metrics: 4 partitions to do" in run.out
-    assert Workspace.open(study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == "99"
-    assert "its code has version" not in study.traps("status", EXPERIMENT).out
+    assert Workspace.open(own_study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == "99"
+    assert "its code has version" not in own_study.traps("status", EXPERIMENT).out
 
 
 def test_an_altered_table_is_named_and_made_again(study: Checkout) -> None:
@@ -239,13 +239,13 @@ def test_a_missing_upstream_exits_with_one_and_names_it(study: Checkout) -> None
 
 
 @pytest.mark.promise
-def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> None:
-    path = study.root / "scene_specs" / "released" / "domino_chain.jsonl"
+def test_a_failing_step_exits_with_one_and_names_the_file(own_study: Checkout) -> None:
+    path = own_study.root / "scene_specs" / "released" / "domino_chain.jsonl"
     lines = path.read_text().splitlines()
     record = json.loads(lines[3])
     record["ground_truth"] = "perhaps"
     path.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]) + "\n")
-    finished = materialize(study, "scene_specs", "--partition", "dominoes")
+    finished = materialize(own_study, "scene_specs", "--partition", "dominoes")
     assert finished.code == 1
     assert f"{path}:4" in finished.out + finished.err
 

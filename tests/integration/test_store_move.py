@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bench.equality import main as compare
-from tests.conftest import SMALL, Checkout, copied
+from tests.conftest import SMALL, Checkout, copy_of
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
@@ -27,7 +27,7 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
 ) -> None:
     monkeypatch.setenv(DATABASE, postgres.address())
     monkeypatch.setenv("TRAPS_SCRATCH", str(tmp_path / "scratch"))
-    study = copied(one_regime, tmp_path)
+    study = copy_of(one_regime, tmp_path)
     with monkeypatch.context() as patched:  # killed once all is there, before it counts
 
         def killed(*_: object) -> None:
@@ -53,7 +53,7 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     assert left.code == 1 and "no such workspace" in left.err and (study.workspace / LEFT).is_file()
     with pytest.raises(TrapsError, match=rf"^{ADDRESS}: the study's ledger lies in {ADDRESS}, and not in a folder"):
         move_to_store(workspace, "s3://lab/elsewhere")
-    other = copied(one_regime, tmp_path / "other")
+    other = copy_of(one_regime, tmp_path / "other")
     remedied(
         lambda: move_to_store(Workspace.open(other.workspace), ADDRESS),
         "study.store_move.move_to_store",

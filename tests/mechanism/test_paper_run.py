@@ -27,13 +27,15 @@ def test_the_tiny_checkpoints_are_asked_what_the_papers_models_are() -> None:
 
 
 @pytest.mark.slow
-def test_the_papers_layers_sweep_doses_and_paths_are_run_on_all_three_families(study: Checkout, tmp_path: Path) -> None:
+def test_the_papers_layers_sweep_doses_and_paths_are_run_on_all_three_families(
+    own_study: Checkout, tmp_path: Path
+) -> None:
     folder = tmp_path / "tiny"
     folder.mkdir()
-    path = write(study.root / "assets" / "models.yaml", folder, SCENARIOS)
-    own = Checkout(study.root, tmp_path / "inside")
+    path = write(own_study.root / "assets" / "models.yaml", folder, SCENARIOS)
+    own = Checkout(own_study.root, tmp_path / "inside")
     (tmp_path / "inside").mkdir()
-    (study.workspace / "clips").rename(own.workspace / "clips")
+    (own_study.workspace / "clips").rename(own.workspace / "clips")
     run = own.traps("run", path, "--until", "probes,cosines,steering_effects,steering_shares")
     assert run.code == 0, run.out + run.err
     tables, settings = Workspace.open(own.workspace).tables, mechanism()

@@ -12,7 +12,7 @@ from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import check_name
 from traps_pipeline.base.network import check_network
 from traps_pipeline.orchestration.selection import require_work
-from traps_pipeline.scenes.trial import check_rendering
+from traps_pipeline.scenes.picture.trial import check_rendering
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -53,7 +53,7 @@ def test_variables_that_choose_an_opengl_that_does_not_draw_are_unset(monkeypatc
         monkeypatch.delenv("MUJOCO_GL")
         monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
 
-    remedied(check_rendering, "scenes.trial.check_rendering", unset)
+    remedied(check_rendering, "scenes.picture.trial.check_rendering", unset)
 
 
 def test_a_name_is_changed_to_what_the_sentence_asks_for() -> None:

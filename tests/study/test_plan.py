@@ -11,6 +11,14 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def study(own_study: Checkout) -> Checkout:
+    """A study whose records the tests correct."""
+    return own_study
+
+
 QUESTION = "Which domino of the row falls last of all?"
 
 

@@ -47,7 +47,7 @@ def _make_specs(workspace: Workspace, category: str) -> Made:
 
 def _evidence(find: str) -> Callable[[Workspace, str | None, Made], Any]:
     def wrong(workspace: Workspace, key: str | None, made: Made) -> Any:
-        from traps_pipeline.benchmark import evidence
+        from traps_pipeline.benchmark import stored_evidence as evidence
 
         return getattr(evidence, find)([item.spec for item in made.beside])
 
@@ -153,7 +153,7 @@ videos = stage(
 
 def _make_arms(workspace: Workspace, category: str) -> Made:
     """The arms and variations of a category's scenarios that the study asks: clips and questions beside the pairs."""
-    from traps_pipeline.benchmark.arms import build_arms
+    from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
@@ -161,20 +161,20 @@ def _make_arms(workspace: Workspace, category: str) -> Made:
 
 
 def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
-    from traps_pipeline.benchmark.arms import film_arms
+    from traps_pipeline.benchmark.filmed_arms import film_arms
 
     frames, is_whole = film_arms(workspace, category, wait=wait)
     return Tally(frames=frames), is_whole
 
 
 def _to_film_s(workspace: Workspace, category: str) -> float:
-    from traps_pipeline.benchmark.arms import seconds_left
+    from traps_pipeline.benchmark.filmed_arms import seconds_left
 
     return seconds_left(workspace, category)
 
 
 def _unmade_arms(workspace: Workspace, category: str) -> list[str]:
-    from traps_pipeline.benchmark.arms import unmade
+    from traps_pipeline.benchmark.filmed_arms import unmade
 
     return unmade(workspace, category)
 

@@ -91,7 +91,7 @@ def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.benchmark.shortcuts import shortcuts
     from traps_pipeline.report.figures.shortcuts import shortcut_figure
     from traps_pipeline.report.writing import figure_bytes
-    from traps_pipeline.scenes.encode import DamagedClip
+    from traps_pipeline.scenes.picture.encode import DamagedClip
 
     rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
     if rows.empty:

@@ -18,7 +18,7 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.scenes.trial import OPENGL, check_rendering
+from traps_pipeline.scenes.picture.trial import OPENGL, check_rendering
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.redaction import redacted
+from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Collect, Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
@@ -29,7 +30,6 @@ from traps_pipeline.orchestration.metadata import preview, visible_metadata
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.scenes.workers import kept_workers
 from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.workspace import Workspace

@@ -1,0 +1,67 @@
+# What maintainers do: measurements, locks, releases, other libraries. Included by the Makefile, whose variables it uses.
+.PHONY: bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-vendor wheel sbom release-check environments
+
+# Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
+test-newest: VENV := .workspaces/newest
+test-newest: BIN := .workspaces/newest/bin
+test-newest: render-packages ## the newest libraries that pyproject.toml admits: what is sent to models, and fast tests
+	rm -rf .workspaces/newest
+	$(make-venv)
+	$(PIP_INSTALL) $(TORCH)
+	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,test,docs]' hatchling
+	$(compile)
+	$(BIN)/python -m pip --disable-pip-version-check list
+	$(BIN)/traps models check
+	$(PYTEST) -n auto $(FAST)
+
+# Of these the campaign has a small version (tests/integration/test_cluster.py).
+test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs
+	$(BIN)/python bench/cluster_study.py --kill
+	$(BIN)/python bench/cluster_study.py --mechanism --kill --at hidden_states
+	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
+
+test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
+	$(BIN)/python -m bench.cluster_kills run cap node stopped postgres network head store together
+
+test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
+	$(BIN)/python bench/cluster_gate.py
+
+bench: setup ## ratios against what one would otherwise use; each script has --quick
+	$(BIN)/python bench/render.py
+	$(BIN)/python bench/ledger.py
+	$(BIN)/python bench/calls.py
+	$(BIN)/python bench/throughput.py
+	$(BIN)/python bench/extraction.py
+	$(BIN)/python bench/probes.py
+	$(BIN)/python bench/scoring.py
+	$(BIN)/python bench/shortcuts.py
+	$(BIN)/python bench/explorer.py
+
+bench-cluster: cluster-setup ## what a cluster costs and gains, against one machine; half an hour to an hour
+	$(BIN)/python bench/cluster.py
+
+explorer-vendor: ## the explorer's libraries, after a version in its package.json was changed; the bundle is checked in
+	cd traps_pipeline/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
+
+lock: ## the locks from pyproject.toml, with uv
+	$(PYTHON) tools/lock.py $(LOCK_OPTIONS)
+
+wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same files
+	$(BIN)/python -m hatchling build -t wheel
+
+sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
+	$(BIN)/python tools/sbom.py dist/sbom.json
+
+# The version stands in pyproject.toml alone, so that an archive without git builds the same wheel; a tag repeats it.
+release-check: setup-core ## whether TAG=v0.2.0 is this version, and no placeholder of this repository is left
+	@version=v$$($(BIN)/python -m hatchling version); test "$$version" = "$(TAG)" || { echo "the tag is $(TAG), the version in pyproject.toml $$version: change one of them"; exit 1; }
+	@! grep -nE 'OWNER|host\.invalid|SECURITY-ADDRESS' pyproject.toml SECURITY.md .github/CODEOWNERS || { echo "put your own in the place of these placeholders"; exit 1; }
+
+# Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.
+ENVIRONMENTS := $(patsubst tests/release/%.txt,.workspaces/environments/%/.installed,$(wildcard tests/release/*.txt))
+PYTHON_eval ?= python3.12
+environments: $(ENVIRONMENTS) ## one file of tests/release, one environment
+.workspaces/environments/%/.installed: tests/release/%.txt
+	$(or $(PYTHON_$*),$(PYTHON)) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	touch $@

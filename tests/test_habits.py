@@ -1,0 +1,150 @@
+"""What hosts and editors read of this repository: workflows, hooks, owners, locks. Each names only what there is."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.conftest import ROOT
+from tools.lock import outdated
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+MAKEFILES = [ROOT / "Makefile", ROOT / "maintainers.mk"]
+TARGETS = {name for file in MAKEFILES for name in re.findall(r"^([a-z-]+):", file.read_text(), re.MULTILINE)}
+
+
+def steps(workflow: Path) -> list[dict[str, Any]]:
+    return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
+
+
+def make_targets(command: str) -> list[str]:
+    """Return the targets of each `make` of a shell command."""
+    calls = re.findall(r"\bmake ([^\n;&|]*)", command)
+    return [word for call in calls for word in takewhile(lambda word: "=" not in word, call.split())]
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_a_workflow_calls_targets_and_programs_that_there_are(workflow: Path) -> None:
+    commands = [step["run"] for step in steps(workflow) if "run" in step]
+    targets = [target for command in commands for target in make_targets(command)]
+    assert targets and {*targets} <= TARGETS
+    for program in re.findall(r"\btools/[\w/.-]+", "\n".join(commands)):
+        assert (ROOT / program).is_file(), program
+
+
+def test_a_workflow_has_no_more_rights_than_it_needs_and_puts_no_name_of_a_branch_into_a_shell() -> None:
+    for workflow in WORKFLOWS:
+        assert yaml.safe_load(workflow.read_text())["permissions"] == {"contents": "read"}, workflow.name
+        for step in steps(workflow):
+            assert "github." not in step.get("run", ""), (workflow.name, step)
+
+
+def test_checks_run_on_every_python_that_the_package_admits_and_every_shard_at_night() -> None:
+    check, nightly = (
+        yaml.safe_load((ROOT / f".github/workflows/{name}.yml").read_text()) for name in ("check", "nightly")
+    )
+    classifiers = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
+    assert check["jobs"]["check"]["strategy"]["matrix"]["python"] == classifiers
+    shards = nightly["jobs"]["campaign"]["strategy"]["matrix"]["shard"]
+    assert shards == [f"{k}/{len(shards)}" for k in range(1, len(shards) + 1)]
+
+
+def test_owners_own_what_there_is_and_every_owner_is_a_placeholder() -> None:
+    lines = [line.split() for line in (ROOT / ".github/CODEOWNERS").read_text().splitlines() if line[0] != "#"]
+    for pattern, *owners in lines:
+        assert [*ROOT.glob(pattern.strip("/"))], pattern
+        assert owners and all(owner.startswith("@OWNER/") for owner in owners)
+
+
+def test_the_files_of_hosts_and_editors_are_what_their_readers_take() -> None:
+    json.loads((ROOT / "renovate.json").read_text())
+    for form in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml"):
+        yaml.safe_load(form.read_text())
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert {hook["id"] for hook in hooks} == {
+        "ruff-check",
+        "ruff-format",
+        "locks",
+        "typos",
+        "private-key",
+        "large-file",
+    }
+    asked = [ROOT / ".github/ISSUE_TEMPLATE/bug.yml", ROOT / ".github/PULL_REQUEST_TEMPLATE.md"]
+    assert all("traps doctor" in file.read_text() for file in asked)
+
+
+def test_make_help_names_the_targets_of_users_first_and_those_of_maintainers_after_them() -> None:
+    printed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    users, _, maintainers = printed.partition("for maintainers")
+    assert "\ntest " in users and "\nlock " in maintainers and "\nlock " not in users
+
+
+def test_a_tag_that_is_another_version_and_a_placeholder_that_is_left_stop_a_release() -> None:
+    def check(tag: str) -> str:
+        command = ["make", "-o", "setup-core", f"BIN={Path(sys.executable).parent}", "release-check", f"TAG={tag}"]
+        finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        return "passes" if finished.returncode == 0 else finished.stdout
+
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert "v0.0.1" in check("v0.0.1") and f"v{version}" in check("v0.0.1")
+    assert "CODEOWNERS" in check(f"v{version}")  # this checkout still has placeholders
+
+
+def test_the_lock_meets_the_project_and_one_that_does_not_is_named(tmp_path: Path) -> None:
+    assert [*outdated()] == []
+    project = tmp_path / "pyproject.toml"
+    text = (ROOT / "pyproject.toml").read_text()
+    project.write_text(text.replace('"rich>=15,<16"', '"rich>=16,<17"').replace('"scipy>=1.17,<2"', '"leftpad>=1"'))
+    sentences = "\n".join(outdated(project))
+    assert "rich" in sentences and "leftpad" in sentences and sentences.count("make lock") == 2
+
+
+def commit(message: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run git with the hook in an empty repository."""
+    git = ["git", "-c", "user.name=t", "-c", "user.email=t@t", "-c", f"core.hooksPath={ROOT / 'tools/hooks'}"]
+    if not (folder / ".git").is_dir():
+        subprocess.run([*git, "init", "-q", folder], check=True)
+    command = [*git, "-C", folder, "commit", "-q", "--allow-empty", "--file=-"]
+    return subprocess.run(command, input=message, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "Add a column for retries",
+        "Bring the clips of a study\n\nThey were left behind where a bucket was slow.\n",
+        "Pass the seed on\n\n" + "x" * 200,
+        "Merge branch 'main' into a-branch-with-a-name-that-is-longer-than-the-seventy-two-characters",
+        'Revert "added a column."',
+        "Use `inside` in the notebook\n# Added by git.\n",
+    ],
+)
+def test_a_message_in_the_form_of_the_page_is_committed(message: str, tmp_path: Path) -> None:
+    finished = commit(message, tmp_path)
+    assert (finished.returncode, finished.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("message", "rule"),
+    [
+        ("Added a column", "imperative"),
+        ("Adds a column", "imperative"),
+        ("Adding a column", "imperative"),
+        ("fix: a column", "capital"),
+        ("Add a column.", "full stop"),
+        ("Add " + "a" * 69, "73 characters"),
+        ("Add a column\nfor retries", "blank line"),
+    ],
+)
+def test_another_message_is_refused_by_the_rule_that_it_breaks(message: str, rule: str, tmp_path: Path) -> None:
+    finished = commit(message, tmp_path)
+    assert finished.returncode != 0 and rule in finished.stderr
