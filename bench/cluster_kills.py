@@ -33,7 +33,7 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 from traps_pipeline.cli.command import OVER_BUDGET
-from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.place import scratch_of
 from traps_pipeline.storage.purse import Purse
 

@@ -27,6 +27,7 @@ ROOMS = (
     "inside",
     "report",
     "orchestration",
+    "cluster",
     "study",
     "release",
     "explorer",

@@ -7,10 +7,10 @@ import dagster as dg
 import traps_pipeline.defs  # noqa: F401 - declares the graph
 from traps_pipeline.base.paths import require_root
 from traps_pipeline.base.redaction import redact_tracebacks
+from traps_pipeline.cluster.lost_runs import lost_runs
 from traps_pipeline.orchestration.assets import WorkspaceResource, assets_of
 from traps_pipeline.orchestration.automation import jobs, sensors
 from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.lost_runs import lost_runs
 from traps_pipeline.storage.workspace import RAY, Workspace
 
 redact_tracebacks()

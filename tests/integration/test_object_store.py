@@ -16,7 +16,7 @@ from bench.equality import main as compare
 from tests.conftest import ROOT, SMALL, Checkout, Finished
 from tests.objectstore import S3
 from tests.postgres import Postgres
-from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 

@@ -21,11 +21,11 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from tests.remedies.test_money import paid
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.orchestration.cluster import require_cluster
+from traps_pipeline.cluster.bucket import Bucket
+from traps_pipeline.cluster.ray_runs import require_cluster
+from traps_pipeline.cluster.same_code import CODE_TAG, code_here, require_same_code
+from traps_pipeline.cluster.shared_history import SharedHistory
 from traps_pipeline.orchestration.run import dagster_history
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
-from traps_pipeline.orchestration.shared_history import SharedHistory
-from traps_pipeline.storage.bucket import Bucket
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
@@ -50,12 +50,12 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
 ) -> None:
     s3.empty()
     content = b"frames"
-    remedied(lambda: Bucket(address).put("a", content), "storage.bucket.Bucket.put", s3.make_bucket)
+    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket.Bucket.put", s3.make_bucket)
     assert Bucket(address).get("a") == content
     monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
     found = remedied(
         lambda: Bucket(address).get("a"),
-        "storage.bucket.Bucket.get",
+        "cluster.bucket.Bucket.get",
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
@@ -97,7 +97,7 @@ def test_a_store_of_azure_is_opened_once_its_account_and_key_are_exported(monkey
         monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "lab")
         monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", "a2V5")
 
-    opened = remedied(lambda: Bucket("az://lab/study"), "storage.bucket.Bucket.__init__", export)
+    opened = remedied(lambda: Bucket("az://lab/study"), "cluster.bucket.Bucket.__init__", export)
     assert opened.address == "az://lab/study"
 
 
@@ -176,7 +176,7 @@ def of_another_host(checkout: Checkout) -> Callable[[], Mapping[str, str]]:
     """The tags of a run that a host with the code of a checkout submits."""
 
     def tags() -> Mapping[str, str]:
-        code = "from traps_pipeline.orchestration.same_code import code_here\nprint(code_here())"
+        code = "from traps_pipeline.cluster.same_code import code_here\nprint(code_here())"
         said = checkout.run(sys.executable, "-c", code)
         assert said.code == 0, said.err
         return {CODE_TAG: said.out.strip()}
@@ -191,7 +191,7 @@ def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -
     file.write_text(ours + "# altered on that host\n")
     remedied(
         lambda: require_same_code(tags(), "lab"),
-        "orchestration.same_code.require_same_code",
+        "cluster.same_code.require_same_code",
         lambda: file.write_text(ours),
     )
     assert tags() == {CODE_TAG: code_here()}

@@ -17,10 +17,10 @@ from tests.postgres import Postgres
 from tests.storage.test_parquet import clip
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import VIDEOS
-from traps_pipeline.storage.bucket import object_name
+from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.leases import alone, leased
-from traps_pipeline.storage.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
 

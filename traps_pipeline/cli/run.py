@@ -161,7 +161,7 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
     if not arguments.cluster:
         yield RunsHere(instance, defs.resolve_implicit_global_asset_job_def())
         return
-    from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
+    from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
 
     require_cluster(workspace, instance)
     given = arguments.runs, arguments.gpus, arguments.on_interrupt, arguments.cpus

@@ -17,12 +17,12 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
+from traps_pipeline.cluster.shared_history import unusable
 from traps_pipeline.models.traffic import remembering_stops
 from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, Runs, this_host
-from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
@@ -75,7 +75,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
     for again in (False, True):
         if workspace.is_on_cluster and home == workspace.dagster_home:
-            from traps_pipeline.orchestration.cluster import dagster_yaml
+            from traps_pipeline.cluster.ray_runs import dagster_yaml
 
             said = yaml.safe_dump(dagster_yaml(str(workspace.study.database), str(workspace.place)), sort_keys=False)
             write_text(home / "dagster.yaml", said)

@@ -21,13 +21,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.redaction import redacted
 from traps_pipeline.base.workers import kept_workers
+from traps_pipeline.cluster.same_code import require_same_code
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Collect, Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
 from traps_pipeline.orchestration.metadata import preview, visible_metadata
-from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.leases import alone

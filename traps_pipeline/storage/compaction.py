@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.bucket import object_name
+from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.removal import removed
 from traps_pipeline.storage.database import Claim, Session
 from traps_pipeline.storage.ledger import ASIDES
-from traps_pipeline.storage.removal import removed
 
 if TYPE_CHECKING:
     from psycopg import Connection
 
-    from traps_pipeline.storage.objects import ObjectStore
+    from traps_pipeline.cluster.objects import ObjectStore
 
 FETCHED = 2000  # rows of a ledger that are held at once while it is read
 SEGMENT = 20_000  # rows of a segment at most

@@ -48,7 +48,7 @@ from traps_pipeline.storage.stream import (
 if TYPE_CHECKING:
     from psycopg import Connection
 
-    from traps_pipeline.storage.objects import ObjectStore
+    from traps_pipeline.cluster.objects import ObjectStore
 
 LOCK_POLL_S = 0.2
 

@@ -1,7 +1,7 @@
 """Where a study's files lie: one interface with two implementations, which what reads and writes files does not tell
 apart (`Workspace.is_shared` does, for what several hosts cannot share).
 
-In a folder of one machine (`FolderStore`), or in an object store that several hosts share (`storage/objects.py`). Code
+In a folder of one machine (`FolderStore`), or in an object store that several hosts share (`cluster/objects.py`). Code
 names a file by its path below the workspace's folder on this machine, makes it there, and hands it over with `keep`;
 before it reads files that another host may have made, it asks for them with `bring`. In a folder both do nothing.
 """

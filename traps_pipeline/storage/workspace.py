@@ -18,10 +18,10 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import ROOT, WORKSPACES, require_root
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.storage.anchor import anchor_of, file_at, store_of, write_anchor
+from traps_pipeline.cluster.anchor import anchor_of, file_at, store_of, write_anchor
+from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.objects import ObjectStore
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
 from traps_pipeline.storage.segments import SegmentLedger

@@ -17,9 +17,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import PART
 from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
+from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.orchestration.machine import check_disk
 from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
-from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
 if TYPE_CHECKING:
@@ -139,8 +139,8 @@ def examine_files(place: Place) -> Iterator[Finding]:
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
     """The objects in a study's store that nobody names and that are older than the grace period, and which of them were
     removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be used."""
-    from traps_pipeline.storage.objects import ObjectStore
-    from traps_pipeline.storage.unused import GRACE_DAYS, remove, unused
+    from traps_pipeline.cluster.objects import ObjectStore
+    from traps_pipeline.cluster.unused import GRACE_DAYS, remove, unused
     from traps_pipeline.storage.workspace import Workspace
 
     store = Workspace.open(place).store

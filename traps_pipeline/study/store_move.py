@@ -13,7 +13,7 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.anchor import write_anchor
+from traps_pipeline.cluster.anchor import write_anchor
 from traps_pipeline.storage.database import session_of
 from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of

@@ -1,7 +1,7 @@
 """Objects in a study's store that nobody names any more: what is found, and how it is removed.
 
 The store's list only proposes. What is removed is named by no row of `traps.objects` or `traps.segments`, and is older
-than a grace period; each removal is told first, for those who bring the same content again (`storage/removal.py`).
+than a grace period; each removal is told first, for those who bring the same content again (`cluster/removal.py`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.bucket import object_name
+from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.objects import ObjectStore
+from traps_pipeline.cluster.removal import removal_lock, tell, tell_end
 from traps_pipeline.storage.database import awake_s
-from traps_pipeline.storage.objects import ObjectStore
-from traps_pipeline.storage.removal import removal_lock, tell, tell_end
 
 if TYPE_CHECKING:
     from psycopg import Connection

@@ -22,6 +22,8 @@ from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
 from traps_pipeline.base.partitions import Cell
+from traps_pipeline.cluster.same_code import CODE_TAG, code_here
+from traps_pipeline.cluster.shared_history import unusable
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage, the_graph
@@ -35,8 +37,6 @@ from traps_pipeline.orchestration.runs import (
     range_tags,
     reason,
 )
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
-from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.orchestration.step import TAKEN, TALLY
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.database import PATIENCE_S
@@ -76,18 +76,18 @@ def dagster_yaml(variable: str, place: str) -> dict[str, Any]:
         "nux": {"enabled": False},
         "storage": {
             "custom": {
-                "module": "traps_pipeline.orchestration.shared_history",
+                "module": "traps_pipeline.cluster.shared_history",
                 "class": "SharedHistory",
                 "config": {"variable": variable},
             }
         },
         "run_launcher": {
-            "module": "traps_pipeline.orchestration.ray_launcher",
+            "module": "traps_pipeline.cluster.ray_launcher",
             "class": "QuotingRayRunLauncher",
             "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1, "runtime_env": _works_in(place)}},
         },
         "compute_logs": {
-            "module": "traps_pipeline.orchestration.shared_logs",
+            "module": "traps_pipeline.cluster.shared_logs",
             "class": "SharedLogs",
             "config": {"place": place},
         },

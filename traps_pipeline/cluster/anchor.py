@@ -9,9 +9,9 @@ from typing import Any
 import yaml
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.bucket import Bucket
+from traps_pipeline.cluster.bucket import Bucket
+from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.database import Session, session_of
-from traps_pipeline.storage.objects import ObjectStore
 from traps_pipeline.storage.place import STUDY
 from traps_pipeline.storage.study import Study
 

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
-from traps_pipeline.storage.bucket import Bucket, object_name
+from traps_pipeline.cluster.bucket import Bucket, object_name
+from traps_pipeline.cluster.removal import SCHEMA, forget, removed
 from traps_pipeline.storage.database import Session, lock_number
-from traps_pipeline.storage.removal import SCHEMA, forget, removed
 from traps_pipeline.storage.store import Lease, Store, is_hidden
 from traps_pipeline.storage.stream import stream_of
 

@@ -15,14 +15,14 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import command, remedied
 from tests.storage.test_compaction import finish, in_database
-from traps_pipeline.storage import unused as module
-from traps_pipeline.storage.bucket import Bucket, object_name
+from traps_pipeline.cluster.bucket import Bucket, object_name
+from traps_pipeline.cluster.objects import ObjectStore
+from traps_pipeline.cluster.removal import ENDS_S
+from traps_pipeline.cluster.unused import _tell, remove, unused
+from traps_pipeline.cluster import unused as module
 from traps_pipeline.storage.database import Session
-from traps_pipeline.storage.objects import ObjectStore
-from traps_pipeline.storage.removal import ENDS_S
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.study import Study
-from traps_pipeline.storage.unused import _tell, remove, unused
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 Open = Callable[[str], ObjectStore]
@@ -153,7 +153,7 @@ def test_an_object_whose_removal_broke_off_may_be_written_once_it_surely_ended(h
 
     remedied(
         lambda: store.write({table(store): OLD}),
-        "storage.removal.forget",
+        "cluster.removal.forget",
         later,
     )
     assert store.bucket.get(object_name(digest(OLD))) == OLD
@@ -168,7 +168,7 @@ def test_a_database_that_names_nothing_of_the_store_is_refused(
     other = ObjectStore(tmp_path / "other", address, Session(postgres.address(), "DB", f"{study}-other"))
     found = remedied(
         lambda: unused(other, grace_days=0),
-        "storage.unused.unused",
+        "cluster.unused.unused",
         again=lambda: unused(host("one"), grace_days=0),
     )
     assert found == [] and names(store) == {object_name(digest(NEW))}

@@ -21,8 +21,8 @@ from dagster._utils.error import serializable_error_info_from_exc_info
 
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.orchestration.cluster import STUDY_TAG, RayRuns, dagster_yaml
-from traps_pipeline.orchestration.lost_runs import fail_lost_runs
+from traps_pipeline.cluster.lost_runs import fail_lost_runs
+from traps_pipeline.cluster.ray_runs import STUDY_TAG, RayRuns, dagster_yaml
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 

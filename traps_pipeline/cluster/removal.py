@@ -1,6 +1,6 @@
 """Objects that are being removed from a study's store, or were: who brings the same content again must be told.
 
-A removal (`storage/unused.py`) is told before it begins, in rows of `traps.removed`, under a lock that whoever names an
+A removal (`cluster/unused.py`) is told before it begins, in rows of `traps.removed`, under a lock that whoever names an
 object holds as well (`removed`). Who finds one brings the content once more, after the removal has ended (`forget`).
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.bucket import object_name
+from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.storage.database import Session, lock_number
 
 if TYPE_CHECKING:

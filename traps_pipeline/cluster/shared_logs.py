@@ -21,7 +21,7 @@ from dagster._serdes import ConfigurableClass, ConfigurableClassData
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.storage.bucket import Bucket
+from traps_pipeline.cluster.bucket import Bucket
 from traps_pipeline.storage.place import scratch_of
 
 UPLOAD_S = 30

@@ -11,11 +11,11 @@ from typing import Any
 from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] - of the extra `cluster`
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.cluster.ray_runs import RUN_CPUS, RUN_GPUS, STUDY_TAG, keys_in, own_tags
+from traps_pipeline.cluster.same_code import CODE_TAG, code_here
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS, STUDY_TAG, keys_in, own_tags
 from traps_pipeline.orchestration.graph import DECLARED, Stage, the_graph
 from traps_pipeline.orchestration.runs import range_of
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.storage.workspace import RAY, Workspace
 
 

@@ -11,9 +11,9 @@ from dagster._core.storage.compute_log_manager import ComputeIOType
 
 from tests.objectstore import S3
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.orchestration.cluster import dagster_yaml
-from traps_pipeline.orchestration.shared_logs import SharedLogs
-from traps_pipeline.storage.bucket import Bucket
+from traps_pipeline.cluster.bucket import Bucket
+from traps_pipeline.cluster.ray_runs import dagster_yaml
+from traps_pipeline.cluster.shared_logs import SharedLogs
 from traps_pipeline.storage.workspace import RAY
 
 

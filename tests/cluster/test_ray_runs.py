@@ -25,9 +25,7 @@ from traps_pipeline.base.progress import Progress, Tally, reporting
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import CLIPS
-from traps_pipeline.defs import benchmark
-from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.cluster import (
+from traps_pipeline.cluster.ray_runs import (
     RESOURCES_TAG,
     STUDY_TAG,
     RayRuns,
@@ -35,11 +33,13 @@ from traps_pipeline.orchestration.cluster import (
     own_tags,
     require_cluster,
 )
+from traps_pipeline.cluster.same_code import CODE_TAG, code_here, installed, require_same_code
+from traps_pipeline.cluster.shared_history import SharedHistory
+from traps_pipeline.defs import benchmark
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.runs import broke_off, range_tags
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installed, require_same_code
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
-from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.study import Study
@@ -104,7 +104,7 @@ def test_rendering_is_as_many_runs_as_the_missing_clips_are_worth(workspace: Wor
 def test_a_person_is_told_once_that_no_host_takes_any_run(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("traps_pipeline.orchestration.cluster.IDLE_S", 0.0)
+    monkeypatch.setattr("traps_pipeline.cluster.ray_runs.IDLE_S", 0.0)
     shown = Shown()
     with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
         run = instance.create_run_for_job(_nothing, tags={"dagster-ray/config": '{"num_cpus": 16}'})
@@ -212,9 +212,7 @@ def test_what_dagster_is_told_holds_no_address_of_the_database(monkeypatch: pyte
 
 @pytest.mark.slow
 def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
-    launcher = pytest.importorskip(
-        "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
-    )
+    launcher = pytest.importorskip("traps_pipeline.cluster.ray_launcher", reason="the extra `cluster` is not installed")
     sent = list[str]()
     base = launcher.QuotingRayRunLauncher.__mro__[1]
     monkeypatch.setattr(base, "_launch_ray_job", lambda self, id_, entrypoint, run: sent.append(entrypoint))
@@ -228,9 +226,7 @@ def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPa
 def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command_line_does(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    launcher = pytest.importorskip(
-        "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
-    )
+    launcher = pytest.importorskip("traps_pipeline.cluster.ray_launcher", reason="the extra `cluster` is not installed")
     monkeypatch.setenv("TRAPS_WORKSPACE", str(Workspace.create(tmp_path / "study", Study(name="lab")).root))
     monkeypatch.setenv("TRAPS_RUN_CPUS", "4")
     monkeypatch.setenv("TRAPS_RUN_GPUS", "1")
