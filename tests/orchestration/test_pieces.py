@@ -33,7 +33,7 @@ class Report:
             self.made[name] += 1
             return {f"tables/{name}.md": f"{name}, made {self.made[name]} times".encode()}
 
-        return Piece(name, reads, make)
+        return Piece(name, make, reads)
 
     def make(self, *, code: str = "1", names: tuple[str, ...] = ("overall", "sub_scenarios")) -> list[str]:
         reads = {"overall": ("leaderboard",), "sub_scenarios": ("metrics", "items")}
