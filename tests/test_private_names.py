@@ -15,6 +15,7 @@ from tests.test_rooms import PACKAGE
 # Each private name of a library, with its library, the files that use it and why no public name will do.
 PRIVATE = {
     "dagster._core.definitions.selector": ("dagster", "cluster/ray_runs.py", "names the job of a submitted run"),
+    "dagster._core.definitions.source_asset": ("dagster", "orchestration/step.py", "hands on without an event"),
     "dagster._core.launcher": ("dagster", "cluster/lost_runs.py", "the state that a launcher gives of a run"),
     "dagster._core.storage.base_storage": ("dagster", "cluster/shared_history.py", "what dagster.yaml may name"),
     "dagster._core.storage.cloud_storage_compute_log_manager": ("dagster", "cluster/shared_logs.py", "uploads"),

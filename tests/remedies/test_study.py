@@ -45,7 +45,7 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     again: list[Callable[[], Any]] = [
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
         refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
-        refused(cards["sheet"], "defs.report._sheet"),
+        refused(cards["sheet"], "defs.report._sheets"),
         refused(cards["gallery"], "defs.report._gallery"),
         refused(cards["shortcuts"], "defs.report._shortcuts"),
         refused(
@@ -114,7 +114,7 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     return [*calls, refused(made, "", error=AssertionError)]
 
 
-FILES = {"sheet": report._sheet, "gallery": report._gallery, "shortcuts": report._shortcuts}
+FILES = {"sheet": report._sheets, "gallery": report._gallery, "shortcuts": report._shortcuts}
 
 
 def may_be_made(workspace: Workspace, stage: str) -> Callable[[], None]:
