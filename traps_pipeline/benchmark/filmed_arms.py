@@ -159,7 +159,7 @@ def _files(clip: Path) -> tuple[Path, ...]:
 @cache
 def _code(arm: str) -> str:
     """The code that films an arm or a variation: after a change of it, it is filmed anew."""
-    names = ("arms.py", "offers.py") if arm in ARM_NAMES else ("variations.py",)
+    names = ("variants/arms.py", "parts/offers.py") if arm in ARM_NAMES else ("variants/variations.py",)
     return digest([file_digest(PACKAGE / "scenes" / name) for name in names])
 
 

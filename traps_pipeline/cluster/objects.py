@@ -1,173 +1,79 @@
 """A study's files in an object store (S3, Google, Azure), for several hosts.
 
-An object is written once, under the SHA-256 of its content, and never renamed. Which object is current under a path is
-a row in PostgreSQL; rows change in one transaction, and the store is never listed. A host keeps what it has fetched in
-its scratch folder, below `.objects` under the same digests, and links it to the paths that people and code know. What
-is read has the size and the digest that the row says.
+An object is written once, under the SHA-256 of its content, and never renamed; `names.py` says which is current under a
+path. A host keeps what it has fetched in its scratch folder, below `.objects` under the same digests, and links it to
+the paths that people and code know. What is read has the size and the digest of its row.
 """
 
 from __future__ import annotations
 
 import re
-import threading
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
+from typing import TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.removal import SCHEMA, forget, removed
-from traps_pipeline.storage.database import Session, lock_number
-from traps_pipeline.storage.store import Lease, Store, is_hidden
-from traps_pipeline.storage.stream import stream_of
-
-if TYPE_CHECKING:
-    from psycopg import Connection
+from traps_pipeline.cluster.database import Database
+from traps_pipeline.cluster.names import Current, Names
+from traps_pipeline.storage.place import STUDY
+from traps_pipeline.storage.store import GRACE_DAYS, Lease, Store, UnusedObject, is_hidden
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 OBJECTS = ".objects"  # in a scratch folder: contents by digest
 AT_ONCE = 16  # transfers side by side
-MANY = ("clips/", "media/")  # of which a process knows only what it has asked for: there may be millions
-_FEW: LiteralString = "number >= 0 and name not like all (%s)"
-_LIKE = ([f"{folder}%" for folder in MANY],)
-FRESH_S = 0.5  # a look at the rows that is younger is not repeated
-TRIES = 2  # to read an object before it counts as altered
-_SCHEMA = """
-create table if not exists traps.changes (study int primary key references traps.studies, number bigint not null);
-create table if not exists traps.objects (
-    study int not null references traps.studies, name text not null,
-    digest bytea, size bigint, note text,  -- of the object that is current; no digest: none is any more
-    number bigint not null,  -- of the change; a later commit has a higher one, so that nobody overlooks it
-    at timestamptz not null default clock_timestamp(), primary key (study, name));
-create index if not exists objects_number on traps.objects (study, number);
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class Current:
-    """What is current under a path: the object's digest and size, the note, and when it was written (ns since 1970)."""
-
-    digest: bytes
-    size: int
-    note: str | None
-    at_ns: int
+BATCH = 1000  # objects that are removed by one request
+_OBJECT = re.compile(r"([0-9a-f]{2})/(\1[0-9a-f]{62})")
 
 
 class ObjectStore(Store):
-    """Files of a study whose contents lie in a bucket and whose names lie in PostgreSQL. Threads may share it."""
+    """Files of a study whose contents lie in a bucket and whose names lie in its database. Threads may share it.
 
-    def __init__(self, root: Path, bucket: Bucket, session: Session) -> None:
+    anchor: the content of the one object with a name, which says where the study's database is.
+    """
+
+    def __init__(self, root: Path, bucket: Bucket, database: Database, study: str, anchor: bytes) -> None:
         super().__init__(root)
-        self.bucket, self.session = bucket, session
-        self._rows: dict[str, Current] = {}
-        self._names: dict[tuple[str, ...], set[str]] = {}  # by the folder that they lie below, at most two deep
-        self._asked = set[str]()  # names in MANY that were looked up; of what changes later every host hears anyhow
-        self._number, self._looked_at = -1, float("-inf")
-        self._guard = threading.RLock()
-        self._there = set[bytes]()  # digests of objects that this process has seen in the store
-        self._whole = set[bytes]()  # digests of contents in the scratch folder that it has compared with their digest
-        session.run(_prepare)
-
-    # --- names ------------------------------------------------------------------------------------------------------
+        self.bucket, self._database, self._study, self._anchor = bucket, database, study, anchor
+        self.names = Names(database, study)
+        self._stored = set[tuple[bytes, int]]()  # digests of objects seen in the store, with `removals` by then
+        self._verified = set[bytes]()  # digests of contents in the scratch folder that were compared with these
 
     def look(self) -> None:
         """See `Store`."""
-        self._refresh(0.0)
-
-    def _refresh(self, age_s: float = FRESH_S) -> None:
-        with self._guard:
-            if time.monotonic() - self._looked_at <= age_s:
-                return
-            began, study = time.monotonic(), self.session.study_id
-
-            def work(connection: Connection[Any]) -> tuple[int, list[Any]]:
-                # The number first: what is committed after it is seen, or seen once more the next time.
-                found = connection.execute("select number from traps.changes where study = %s", [study]).fetchone()
-                if self._number < 0:
-                    return found[0] if found else 0, self._read(connection, _FEW, *_LIKE)
-                newer = self._read(connection, "number > %s", self._number)
-                return max([self._number, *(row[-1] for row in newer)]), newer
-
-            self._number, rows = self.session.run(work)
-            self._take(rows)
-            self._looked_at = began
-
-    def _read(self, connection: Connection[Any], condition: LiteralString, *values: Any) -> list[Any]:
-        sql: LiteralString = """select name, digest, size, note, (extract(epoch from at) * 1e9)::bigint, number
-                                from traps.objects where study = %s and """
-        return connection.execute(sql + condition, [self.session.study_id, *values]).fetchall()
-
-    def _take(self, rows: Iterable[Any]) -> None:
-        for name, digest, size, note, at_ns, _ in rows:
-            if digest is None:
-                self._rows.pop(name, None)
-                self._names.get(_group(name), set()).discard(name)
-            else:
-                self._names.setdefault(_group(name), set()).add(name)
-                self._rows[name] = Current(bytes(digest), size, note, at_ns)
-
-    def _ask(self, paths: Iterable[Path]) -> None:
-        """Look up those of these names that are in MANY and were not looked up before."""
-        names = {name for name in map(self._name, paths) if name.startswith(MANY)}
-        with self._guard:
-            if new := sorted(names - self._asked):
-                self._refresh()  # from here on, of what changes everybody hears
-                self._take(self.session.run(lambda c: self._read(c, "name = any(%s)", new)))
-                self._asked |= {*new}
+        self.names.look()
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
+    def _known(self, paths: Iterable[Path]) -> dict[Path, Current]:
+        names = {path: self._name(path) for path in paths}
+        current = self.names.current({*names.values()})
+        return {path: current[name] for path, name in names.items() if name in current}
+
     def _current(self, path: Path) -> Current | None:
-        self._refresh()
-        self._ask([path])
-        return self._rows.get(self._name(path))
+        return self._known([path]).get(path)
 
-    def _change(self, rows: Sequence[tuple[str, bytes | None, int | None, str | None]]) -> None:
-        """Let other objects be current, all in one transaction. The row of the study's changes is locked until then,
-        so that changes are numbered in the order in which they are seen."""
-        study = self.session.study_id
-        columns = [list(column) for column in zip(*rows, strict=True)]
-        digests = [digest for _, digest, *_ in rows if digest is not None]
-
-        def work(connection: Connection[Any]) -> list[bytes]:
-            if gone := removed(connection, study, digests):
-                return gone
-            ((number,),) = connection.execute(
-                """insert into traps.changes (study, number) values (%s, 1)
-                   on conflict (study) do update set number = traps.changes.number + 1 returning number""",
-                [study],
-            ).fetchall()
-            connection.execute(
-                """insert into traps.objects (study, name, digest, size, note, number)
-                   select %s, o.name, o.digest, o.size, o.note, %s
-                   from unnest(%s::text[], %s::bytea[], %s::bigint[], %s::text[]) as o (name, digest, size, note)
-                   on conflict (study, name) do update set digest = excluded.digest, size = excluded.size,
-                       note = excluded.note, number = excluded.number, at = excluded.at""",
-                [study, number, *columns],
-            )
-            return []
-
-        if rows:
-            while gone := self.session.run(work):
-                forget(self.session, self.bucket.address, gone)
-                _side_by_side(lambda d: self.bucket.put(object_name(d), self._cached(d).read_bytes()), gone)
-            self.look()
+    def _change(self, changed: Mapping[Path, Current | None], removals: int) -> None:
+        named = {self._name(path): row for path, row in changed.items()}
+        while (now := self.names.change(named, removals)) != removals:
+            removals = now
+            for row in changed.values():
+                if row is not None:
+                    self.bucket.put(object_name(row.digest), self._cached(row.digest).read_bytes())
 
     def _withdraw(self, lost: Iterable[bytes]) -> None:
-        """Objects that are gone, or not what was written, are current no more: what needs them is made again."""
+        """Let objects that are gone, or altered, be current no more: what needs them is made again."""
         gone = {*lost}
-        with self._guard:
-            self._there -= gone
-            rows = self.session.run(lambda c: self._read(c, "digest = any(%s)", [*gone]))
-            self._change([(row[0], None, None, None) for row in rows])
+        self._stored = {seen for seen in self._stored if seen[0] not in gone}
+        named = self.names.naming(gone)
+        self._change({self.root / name: None for name in named}, self.names.removals)
 
     # --- contents ---------------------------------------------------------------------------------------------------
 
@@ -176,117 +82,99 @@ class ObjectStore(Store):
 
     def _is_cached(self, digest: bytes) -> bool:
         path = self._cached(digest)
-        if digest not in self._whole:
-            try:
-                if sha256(path.read_bytes()).digest() != digest:
-                    return False
-            except FileNotFoundError:
-                return False
-            self._whole.add(digest)
-        return path.is_file()
+        if digest not in self._verified and path.is_file() and sha256(path.read_bytes()).digest() == digest:
+            self._verified.add(digest)
+        return digest in self._verified and path.is_file()
 
-    def content(self, digest: bytes, size: int) -> tuple[Path | None, str]:
-        """The content of an object in the scratch folder, or what is wrong with it. Raises TrapsError where the store
-        cannot be used."""
-        path, wrong = self._cached(digest), ""
-        if self._is_cached(digest):
-            return path, ""
-        for _ in range(TRIES):
-            found = self.bucket.get(object_name(digest))
-            if found is not None and len(found) == size and sha256(found).digest() == digest:
-                write_bytes(path, found)
-                self._whole.add(digest)
-                self._there.add(digest)
-                return path, ""
-            wrong = "is gone from the store" if found is None else "is not what was written (it was altered)"
-        return None, wrong
+    def _cache(self, digest: bytes, content: bytes, *, durable: bool = False) -> Path:
+        if not self._is_cached(digest):
+            write_bytes(self._cached(digest), content, durable=durable)
+            self._verified.add(digest)
+        return self._cached(digest)
 
-    def put(self, content: bytes) -> bytes:
-        """Write an object that has no path; its digest. Raises TrapsError."""
-        forget(self.session, self.bucket.address, [sha256(content).digest()])
-        return self._put(content, None)
+    def _is_stored(self, digest: bytes) -> bool:
+        return (digest, self.names.removals) in self._stored
 
-    def _fetched(self, row: Current, name: str) -> Path:
-        """The content of an object in the scratch folder. Raises TrapsError where it is gone or altered."""
-        path, wrong = self.content(row.digest, row.size)
-        if path is not None:
-            return path
+    def _put(self, content: bytes, row: Current | None, removals: int) -> bytes:
+        """Bring a content to the store, unless it is what is current and is seen there; return its digest."""
+        digest = sha256(content).digest()
+        is_current = row is not None and row.digest == digest
+        if not (is_current and (self._is_stored(digest) or self.bucket.size(object_name(digest)) == len(content))):
+            self.bucket.put(object_name(digest), content)
+        self._stored.add((digest, removals))
+        return digest
+
+    def _fetched(self, row: Current, path: Path) -> Path:
+        """Return the content of an object in the scratch folder. Raises TrapsError where it is gone or altered."""
+        if self._is_cached(row.digest):
+            return self._cached(row.digest)
+        removals, content = self.names.removals, self.bucket.get(object_name(row.digest))
+        if content is not None and len(content) == row.size and sha256(content).digest() == row.digest:
+            self._stored.add((row.digest, removals))
+            return self._cache(row.digest, content)
         self._withdraw([row.digest])
-        raise TrapsError(f"{self.bucket.address}/{name}: {wrong}; run again, and it is made anew")
+        wrong = "is gone from the store" if content is None else "is not what was written (it was altered)"
+        raise TrapsError(f"{self.bucket.address}/{self._name(path)}: {wrong}; run again, and it is made anew")
 
     def here(self, path: Path) -> Path:
         """See `Store`."""
         row = self._current(path)
         if row is None:
             raise FileNotFoundError(f"{self.bucket.address}/{self._name(path)}")
-        return self._fetched(row, self._name(path))
+        return self._fetched(row, path)
 
     def bring(self, paths: Iterable[Path]) -> None:
         """See `Store`. What is gone from the store and lies at its path still is left there."""
 
-        def one(path: Path) -> None:
-            row = self._current(path)
-            if row is None or (is_same_file(path, self._cached(row.digest)) and self._is_cached(row.digest)):
-                return
+        def one(known: tuple[Path, Current]) -> None:
+            path, row = known
+            cached = self._cached(row.digest)
             if not self._is_cached(row.digest) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
-                link(path, self._cached(row.digest))
-                return
+                link(path, cached)
             try:
-                link(self._fetched(row, self._name(path)), path)
+                if not (self._is_cached(row.digest) and is_same_file(path, cached)):
+                    link(self._fetched(row, path), path)
             except TrapsError:
                 if self._current(path) is not None:
                     raise  # the store cannot be reached; where it has no such object, nobody has
 
-        mine = {path for path in paths if path.is_relative_to(self.root)}
-        self._ask(mine)
-        _side_by_side(one, mine)
+        _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
 
     def keep(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
+        kept = {*paths}
+        known, removals = self._known(kept), self.names.removals
 
-        def one(path: Path) -> tuple[str, bytes | None, int | None, str | None] | None:
-            row = self._current(path)
-            if row is not None and row.digest in self._there and is_same_file(path, self._cached(row.digest)):
+        def one(path: Path) -> tuple[Path, Current] | None:
+            row = known.get(path)
+            if row is not None and self._is_stored(row.digest) and is_same_file(path, self._cached(row.digest)):
                 return None
             content = path.read_bytes()
-            digest = self._put(content, None if row is None else row.digest)
+            digest = self._put(content, row, removals)
             link(path, self._cached(digest))
-            self._whole.add(digest)
-            is_known = row is not None and row.digest == digest
-            return None if is_known else (self._name(path), digest, len(content), None)
+            self._verified.add(digest)
+            return None if row is not None and row.digest == digest else (path, Current(digest, len(content)))
 
-        kept = {*paths}
-        self._ask(kept)
-        self._change([row for row in _side_by_side(one, kept) if row is not None])
-
-    def _put(self, content: bytes, current: bytes | None) -> bytes:
-        """Bring a content to the store, unless it is what is current and is seen there; its digest. What is current no
-        more may be gone from the store, whatever this process has seen."""
-        digest = sha256(content).digest()
-        name = object_name(digest)
-        if digest != current or (digest not in self._there and self.bucket.size(name) != len(content)):
-            self.bucket.put(name, content)
-        self._there.add(digest)
-        return digest
+        self._change(dict(pair for pair in _side_by_side(one, kept) if pair is not None), removals)
 
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
         """See `Store`."""
+        known, removals = self._known(files), self.names.removals
 
-        def one(path: Path) -> tuple[str, bytes | None, int | None, str | None]:
-            content, row = files[path], self._current(path)
-            digest = self._put(content, None if row is None else row.digest)
-            if digest not in self._whole:
-                write_bytes(self._cached(digest), content, durable=durable)
-                self._whole.add(digest)
-            return self._name(path), digest, len(content), note
+        def one(path: Path) -> tuple[Path, Current]:
+            digest = self._put(files[path], known.get(path), removals)
+            self._cache(digest, files[path], durable=durable)
+            return path, Current(digest, len(files[path]), note)
 
-        self._change(_side_by_side(one, {*files}))
+        self._change(dict(_side_by_side(one, files)), removals)
         self.bring(files)
+        if self.root / STUDY in files:
+            self.bucket.put(STUDY, self._anchor)  # last, so that it vouches for the study
 
     def remove(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
-        named = [path for path in paths if self._current(path) is not None]
-        self._change([(self._name(path), None, None, None) for path in named])
+        named = self._known(paths)
+        self._change(dict.fromkeys(named), self.names.removals)
         for path in named:
             path.unlink(missing_ok=True)
 
@@ -298,11 +186,11 @@ class ObjectStore(Store):
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
         """See `Store`. Each object is looked for in the store, once a process."""
-        rows = self._known(paths)
-        unseen = {row.digest: row for row in rows.values() if row.digest not in self._there}
-        found = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), {*unseen}))
-        lost = {digest for digest, size in found.items() if size != unseen[digest].size}
-        self._there |= found.keys() - lost
+        rows, removals = self._known(paths), self.names.removals
+        unseen = {row.digest: row for row in rows.values() if not self._is_stored(row.digest)}
+        sizes = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), unseen))
+        lost = {digest for digest, size in sizes.items() if size != unseen[digest].size}
+        self._stored |= {(digest, removals) for digest in sizes.keys() - lost}
         if lost:
             self.bucket.get(object_name(next(iter(lost))))  # tells a bucket that is gone from one without this object
             self._withdraw(lost)
@@ -316,35 +204,12 @@ class ObjectStore(Store):
         """See `Store`. They are those of the rows."""
         return {path: row.digest.hex() for path, row in self._known(paths).items()}
 
-    def _known(self, paths: Iterable[Path]) -> dict[Path, Current]:
-        wanted = {*paths}
-        self._ask(wanted)
-        self._refresh()
-        return {path: row for path in wanted if (row := self._rows.get(self._name(path))) is not None}
-
-    def lease(self, name: str) -> Lease | None:
-        """See `Store`. An advisory lock of this process's session."""
-        lock = lock_number(f"{self.session.study}/lease/{name}")
-        if not self.session.take(lock):
-            return None
-        stream_of(self.session).start()  # whose thread keeps the session alive while something is held
-        return Lease(lambda: self.session.give_back(lock))
-
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
-        self._refresh()
-        if "*" not in pattern:
-            return [folder / pattern] if self.has(folder / pattern) else []
-        if f"{self._name(folder)}/".startswith(MANY):
-            prefix = f"{self._name(folder)}/"
-            self._take(self.session.run(lambda c: self._read(c, "starts_with(name, %s)", prefix)))
-        start, group = f"{self._name(folder)}/", self._name(folder).split("/")[:2]
-        with self._guard:
-            near = [names for key, names in self._names.items() if list(key[: len(group)]) == group[: len(key)]]
-            names = [name for of in near for name in of if name.startswith(start)]
+        start = f"{self._name(folder)}/"
         matches = re.compile(_regex(pattern)).fullmatch
-        inside = {name.removeprefix(start) for name in names}
-        return sorted(folder / name for name in inside if matches(name) and not is_hidden(Path(name)))
+        inside = (name.removeprefix(start) for name in self.names.below(self._name(folder)))
+        return [folder / name for name in inside if matches(name) and not is_hidden(Path(name))]
 
     def note(self, path: Path) -> str | None:
         """See `Store`."""
@@ -356,28 +221,41 @@ class ObjectStore(Store):
         row = self._current(path)
         return 0 if row is None else row.at_ns
 
+    def lease(self, name: str) -> Lease | None:
+        """See `Store`."""
+        return self._database.lease(name)
 
-def _group(name: str) -> tuple[str, ...]:
-    return tuple(name.split("/")[:-1][:2])
+    def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
+        """See `Store`."""
+        before = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
+        objects = {
+            bytes.fromhex(match[2]): UnusedObject(name, size, at)
+            for name, size, at in self.bucket.names()
+            if (match := _OBJECT.fullmatch(name))
+        }
+        named = {*self.names.naming().values()}
+        if objects and not objects.keys() & named:
+            raise TrapsError(
+                f"{self.bucket.address}: holds {len(objects)} objects, and the database names none of them for the "
+                f"study {self._study}; see that its variable has the address of the study's own database: nothing was "
+                "removed"
+            )
+        unnamed = (digest for digest, one in objects.items() if digest not in named and one.at < before)
+        old = sorted(unnamed, key=lambda digest: objects[digest].at)
+        if is_removed:
+            batches = [old[first : first + BATCH] for first in range(0, len(old), BATCH)]
+            delete = lambda digests: self.bucket.delete([object_name(digest) for digest in digests])  # noqa: E731
+            old = [digest for batch in batches for digest in self.names.remove(batch, delete)]
+        return [objects[digest] for digest in old]
 
 
 def _regex(pattern: str) -> str:
-    """What a pattern of `pathlib` means, as far as it is used here: `*` within a name, `**/` for any folders."""
-    made = re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*")
-    return made.replace(r"\*", "[^/]*")
-
-
-def _prepare(connection: Connection[Any]) -> None:
-    """Make the tables if there are none."""
-    connection.execute("select pg_advisory_xact_lock(%s)", [lock_number("schema")])
-    for statement in _SCHEMA.split(";\n"):
-        if statement.strip():
-            connection.execute(statement)
-    connection.execute(SCHEMA)
+    """Return what a pattern of `pathlib` means, as far as it is used here: `*` within a name, `**/` for any folders."""
+    return re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*").replace(r"\*", "[^/]*")
 
 
 def _side_by_side(work: Callable[[T], R], of: Iterable[T]) -> list[R]:
-    """What `work` returns of each, several at once."""
+    """Return what `work` returns of each, several at once."""
     each = list(of)
     if len(each) < 2:
         return [work(one) for one in each]

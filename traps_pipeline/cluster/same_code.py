@@ -6,7 +6,7 @@ import json
 import re
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -14,14 +14,14 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
 
-CODE_TAG = "traps/code"  # of runs: the code of the host that submitted them
+CODE = "TRAPS_CODE"  # of a run: the code of the host that submitted it
 DISTRIBUTION = "traps-pipeline"
 _NAME, _NOT_FOR_RUNS = re.compile(r"[\w.-]+"), re.compile(r"extra == ['\"](dev|docs|sign|test)['\"]")
 
 
 @cache
 def code_here() -> str:
-    """This host's code, as JSON: digests of the package's own files and of those that people edit (`assets/`,
+    """Return this host's code, as JSON: digests of the package's own files and of those that people edit (`assets/`,
     `scene_specs/`), and the versions of Python and of every package that `pyproject.toml` names and that is here."""
     folders = {"the package": PACKAGE, "assets": ASSETS, "scene_specs": SCENE_SPECS}
     files = {name: _digest_of(folder) for name, folder in folders.items()}
@@ -29,45 +29,42 @@ def code_here() -> str:
 
 
 def installed() -> dict[str, str]:
-    """Versions of Python, of this package, and of what it names, by name; what is not installed is left out. Builds for
-    other hardware (`+cpu`, `+cu128`) are the same version."""
+    """Return versions of Python, of this package, and of what it names, by name; what is not installed is left out.
+
+    Builds for other hardware (`+cpu`, `+cu128`) are the same version.
+    """
     from importlib.metadata import PackageNotFoundError, requires, version
 
-    wanted = [line for line in requires(DISTRIBUTION) or () if not _NOT_FOR_RUNS.search(line)]
-    found = {"python": ".".join(map(str, sys.version_info[:2]))}
-    for name in sorted({DISTRIBUTION, *(match[0] for line in wanted if (match := _NAME.match(line)))}):
+    requirements = [line for line in requires(DISTRIBUTION) or () if not _NOT_FOR_RUNS.search(line)]
+    versions = {"python": ".".join(map(str, sys.version_info[:2]))}
+    for name in sorted({DISTRIBUTION, *(match[0] for line in requirements if (match := _NAME.match(line)))}):
         try:
-            found[name] = version(name).partition("+")[0]
+            versions[name] = version(name).partition("+")[0]
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
-def require_same_code(tags: Mapping[str, str], study: str) -> None:
-    """Raises TrapsError where a run was submitted by a host with other code than this one's. What only one of the two
-    has installed is not compared: a host without a GPU need not have what a GPU wants."""
-    if CODE_TAG not in tags:
+def require_same_code(submitted: str, study: str) -> None:
+    """Check that a run was submitted by a host with the same code, which `code_here` returned there. Raises TrapsError.
+
+    What only one of the two has installed is not compared: a host without a GPU need not have what a GPU wants.
+    """
+    if not submitted:
         return
-    here, there = _flat(code_here()), _flat(tags[CODE_TAG])
-    differ = [name for name in sorted(here.keys() & there.keys()) if here[name] != there[name]]
-    if differ:
-        told = ", ".join(f"{name} {here[name]} here and {there[name]} there" for name in differ)
+    here, there = _flat(code_here()), _flat(submitted)
+    if differences := [name for name in sorted(here.keys() & there.keys()) if here[name] != there[name]]:
+        described = ", ".join(f"{name} {here[name]} here and {there[name]} there" for name in differences)
         raise TrapsError(
             f"the host {socket.gethostname()} has other code than the host that submitted this run of the study "
-            f"{study}: {told}. Install the same version of the package from the same lock on both, and run the same "
-            "command again"
+            f"{study}: {described}. Install the same version of the package from the same lock on both, and run the "
+            "same command again"
         )
 
 
-def _flat(said: str) -> dict[str, str]:
-    """What is compared, by name. Something that no host of this version says is one thing that differs."""
-    try:
-        parsed = json.loads(said)
-        return {f"files of {name}": str(one) for name, one in parsed["files"].items()} | {
-            str(name): str(one) for name, one in parsed["versions"].items()
-        }
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return {DISTRIBUTION: said[:80]}
+def _flat(code: str) -> dict[str, str]:
+    parsed = json.loads(code)
+    return {f"files of {name}": digest for name, digest in parsed["files"].items()} | parsed["versions"]
 
 
 def _digest_of(folder: Path) -> str:

@@ -22,7 +22,6 @@ from dagster._core.definitions.source_asset import SYSTEM_METADATA_KEY_SOURCE_AS
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.redaction import redacted
-from traps_pipeline.cluster.same_code import require_same_code
 from traps_pipeline.orchestration.checks import StageChecks, raise_for_run
 from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.history import History
@@ -79,7 +78,6 @@ class _Step:
         if context.run.run_id not in _ATTEMPTS:
             _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
         wanted = Wanted(workspace, self.tags.get(EXPERIMENT_TAG))
-        require_same_code(self.tags, workspace.study.name)
         require_machine(workspace, parts_of_run(context, stage, wanted))
         self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
         self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
