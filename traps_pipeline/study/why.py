@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
@@ -15,6 +15,10 @@ from traps_pipeline.models.registry import load_models
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
+
+# Without the times of calls, for which pyarrow would import pandas.
+_OF_ANSWER = ("item_id", "text", "error", "outcome")
+_OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "rationale", "invalid_reason")
 
 
 def why(workspace: Workspace, item_id: str) -> Iterator[str]:
@@ -49,19 +53,21 @@ def why(workspace: Workspace, item_id: str) -> Iterator[str]:
 
 def _judged(workspace: Workspace, cell: Cell, item_id: str) -> Iterator[str]:
     """The answer to an item as its table has it, and the votes on it."""
-    for answer in _rows_of(workspace, RESPONSES, cell, item_id):
+    for answer in _rows_of(workspace, RESPONSES, _OF_ANSWER, cell, item_id):
         said = _short(answer["text"]) if answer["text"] else answer["error"] or ""
         yield f"    {answer['outcome']}: {said}"
-    for vote in _rows_of(workspace, VOTES, cell, item_id):
+    for vote in _rows_of(workspace, VOTES, _OF_VOTE, cell, item_id):
         decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
         word = "invalid" if not vote["valid"] else "yes" if decision else "no"
         yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
 
 
-def _rows_of(workspace: Workspace, table: Table, cell: Cell, item_id: str) -> list[dict[str, Any]]:
+def _rows_of(
+    workspace: Workspace, table: Table, columns: Sequence[str], cell: Cell, item_id: str
+) -> list[dict[str, Any]]:
     if workspace.tables.state(table, cell.partition) is None:
         return []
-    return [row for row in workspace.tables.records(table, cell.partition) if row["item_id"] == item_id]
+    return [row for row in workspace.tables.records(table, cell.partition, columns) if row["item_id"] == item_id]
 
 
 def _about(row: Mapping[str, Any]) -> Any:
