@@ -47,6 +47,6 @@ def test_a_step_that_is_dropped_when_the_disk_is_full_is_closed_at_the_end_of_it
         yield from workspace.until_torn_down(events())
 
     given = {"workspace": WorkspaceResource(root=str(workspace.root))}
-    with dagster_history(workspace) as history, pytest.raises(Exception, match="File too large|could not be written"):
+    with dagster_history(workspace) as history, pytest.raises(Exception, match=r"File too large|could not be written"):
         dg.materialize([table], instance=history, resources=given)
     assert steps == ["closed"]
