@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.judging.test_validation import MODEL, labelled_study
+from tests.build.labels import MODEL, labelled_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import personal_tokens, public_name
 from traps_pipeline.cli import main

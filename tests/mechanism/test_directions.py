@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.build.directions import origin, pair_states
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.directions import (
     KINDS,
     NULLS,
-    Origin,
     cosine_matrix,
     direction_scenarios,
     extract_directions,
@@ -24,16 +24,6 @@ from traps_pipeline.mechanism.directions import (
 )
 
 NAMES = [f"plinko-{n:04d}" for n in range(200)]
-
-
-def pair_states(layers: int = 3, pairs: int = 30, width: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(0)
-    control = rng.normal(size=(layers, pairs, width)).astype(np.float32)
-    return control + rng.normal(scale=0.1, size=control.shape).astype(np.float32), control
-
-
-def origin() -> Origin:
-    return Origin("m", "folder", "d1", "float32", "none", "chaotic", "standard", "last", 7, ("a", "b"), "d2")
 
 
 def test_the_void_direction_is_the_unit_mean_difference() -> None:

@@ -14,8 +14,8 @@ from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 import pytest
 
+from tests.build.calls import allowed_by, body, entry_of, request
 from tests.conftest import KEY, ROOT, SECRET
-from tests.models.test_shapes import allowed_by, body, entry_of, request
 from tests.providers.servers import answering, closed_port, self_signed, silent
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.build.frames import frames
 from tests.foreign_page import CHROMIUM, QUIET
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -28,17 +29,6 @@ from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.spec import load_trajectory
-
-
-def frames(count: int = 20, height: int = 120, width: int = 160) -> list[np.ndarray]:
-    """A bright square that moves over a gradient; no two frames alike."""
-    ramp = np.linspace(0, 200, width).astype(np.uint8)
-    drawn = []
-    for i in range(count):
-        frame = np.repeat(np.tile(ramp, (height, 1))[..., None], 3, axis=2)
-        frame[40:80, 5 * i : 5 * i + 40] = (230, 40, 30)
-        drawn.append(frame)
-    return drawn
 
 
 @pytest.fixture

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import ROOT
+from tests.build.families import PAGE, Add, add
 from tests.scenes.released import Released
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.benchmark.composition import load_composition
-from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes import registry
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.independence import dependence
@@ -27,37 +24,7 @@ from traps_pipeline.scenes.resolve import Resolved
 from traps_pipeline.scenes.sample import Draw, sample_family, simulated_answer, try_draw
 from traps_pipeline.scenes.wording import draw_ill_posed
 
-(PAGE,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL | re.MULTILINE)
-Add = Callable[..., None]
-
-
-def forget() -> None:
-    for cached in (registry.family_names, registry.get_family, registry.families, registry.fit_to_sample):
-        cached.cache_clear()
-    family_asking.cache_clear()
-
-
-@pytest.fixture
-def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Add]:
-    """Adds a family file beside the others for one test: the page's, with some of its text replaced."""
-    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
-    added: list[str] = []
-
-    def add(name: str, **changes: Sequence[str]) -> None:
-        text = PAGE.replace('"plank_post"', f'"{name}"')
-        for old, new in changes.values():
-            assert old in text
-            text = text.replace(old, new)
-        (tmp_path / f"{name}.py").write_text(text)
-        added.append(name)
-        forget()
-
-    yield add
-    monkeypatch.undo()
-    for name in added:
-        sys.modules.pop(f"{package.__name__}.{name}", None)
-    forget()
-
+__all__ = ["add"]  # fixtures
 
 # --- the family of the page -------------------------------------------------------------------------------------------
 

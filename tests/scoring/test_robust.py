@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.scoring.test_arms import of_arm, write
+from tests.build.verdicts import of_arm, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs import scoring

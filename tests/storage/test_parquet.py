@@ -12,21 +12,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from tests.build.video_rows import PARTITION, clip
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import VIDEOS, VideoRow
 from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.storage.parquet import State, TableStore, write_sealed
 
-PARTITION = {"category": "plinko"}
 CELL = {"dataset": "chaotic", "model": "m", "regime": "standard", "run": 1}
-
-
-def clip(scenario: str, side: str = "control", **changes: Any) -> VideoRow:
-    """A row of the videos table."""
-    texts = {name: f"{name} of {scenario}" for name in ("path", "file_sha256", "frames_sha256", "scene_hash")}
-    numbers = {"n_frames": 50, "fps": 10, "width": 480, "height": 360, "duration_s": 5.0, "size_bytes": 1000}
-    row = {"scenario_id": scenario, "category": "plinko", "side": side, "benchmark_version": "0.1.0"}
-    return VideoRow(**(row | texts | numbers | changes))
 
 
 def answer(item: str, **changes: Any) -> ResponseRow:
