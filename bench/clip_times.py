@@ -64,9 +64,9 @@ def work() -> None:
     released = importlib.import_module(f"{base}.paths").RELEASED
     from traps_pipeline.benchmark.composition import load_composition
     from traps_pipeline.benchmark.records import load_released
-    from traps_pipeline.scenes.certify import certify
-    from traps_pipeline.scenes.clips import Job, read_clip, render_pair
-    from traps_pipeline.scenes.spec import load_trajectory
+    from traps_pipeline.scenes.certification.certify_record import certify
+    from traps_pipeline.scenes.worlds.clips import Job, read_clip, render_pair
+    from traps_pipeline.scenes.worlds.spec import load_trajectory
 
     specs, package = load_released(), Path(str(traps_pipeline.__file__)).resolve().parent
     print(json.dumps({"package": str(package), "scenarios": load_composition()}), flush=True)

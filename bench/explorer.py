@@ -33,7 +33,7 @@ from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.scenes.encode import encode, frames_digest
+from traps_pipeline.scenes.picture.encode import encode, frames_digest
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts, regime_tests
 from traps_pipeline.scoring.leaderboard import leaderboard

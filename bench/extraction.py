@@ -32,7 +32,7 @@ from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick
 
 SYSTEM = "You are a helpful visual question answering assistant. Please answer the question based on the video."

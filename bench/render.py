@@ -22,15 +22,15 @@ import numpy as np
 
 from bench.quick import parse
 from traps_pipeline.base.paths import RELEASED
+from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
-from traps_pipeline.scenes.clips import Job, render_pair
-from traps_pipeline.scenes.kit import Physics
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
-from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.clips import Job, render_pair
+from traps_pipeline.scenes.worlds.outcome import compile_scene
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 SCENES = ("domino_chain-0001", "hidden_race-0001", "plinko-0001", "seesaw_sorter-0001", "tumbling_dice-0001")
 

@@ -33,15 +33,15 @@ from bench.quick import parse
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.foretelling import foretold
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.certificates import CLOSING, REFERENTS, Certificate, stored_evidence
-from traps_pipeline.scenes.certify import state_at_cut
-from traps_pipeline.scenes.checks import control_frames
-from traps_pipeline.scenes.encode import encode
-from traps_pipeline.scenes.evidence import Claim
-from traps_pipeline.scenes.likeness import NEAR_BITS, perceptual_hash
+from traps_pipeline.scenes.certification.certificates import CLOSING, REFERENTS, Certificate, stored_evidence
+from traps_pipeline.scenes.certification.certify_record import state_at_cut
+from traps_pipeline.scenes.certification.evidence import Claim
+from traps_pipeline.scenes.draw.likeness import NEAR_BITS, perceptual_hash
 from traps_pipeline.scenes.observe import observe
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.picture.checks import control_frames
+from traps_pipeline.scenes.picture.encode import encode
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 

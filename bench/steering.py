@@ -3,9 +3,9 @@
     python bench/steering.py [--model ID | --random] [--prompts 8] [--directions 8] [--layer L]
 
 Plain: one batch for each direction and dose, which shows the vision tower every clip again. Shipped: rows of all
-directions and doses share batches, the vision tower sees each clip once (`models/local/clips.py`), and what the blocks
-below the steered one make of a prompt is kept (`models/local/prefixes.py`). Answers must be equal, token by token.
-Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU they are seconds.
+directions and doses share batches, the vision tower sees each clip once (`models/local/vision_cache.py`), and what the
+blocks below the steered one make of a prompt is kept (`models/local/prefixes.py`). Answers must be equal, token by
+token. Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU they are seconds.
 
 Then the states of every clip under four prompts, as a study reads those of a control (two questions, two system
 prompts): each pass with its own vision pass, against passes that remember the clip. States must be equal, bit for bit.
@@ -31,11 +31,11 @@ from bench.quick import parse
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import Generated, LocalModel, load_local_model
-from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.tiny import build_tiny
+from traps_pipeline.models.local.vision_cache import ClipMemory
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick, resized
 
 T = TypeVar("T")

@@ -32,9 +32,9 @@ def _clips(folder: Path) -> Iterator[Path]:
     """Real clips: the control of a released scenario, each shifted by another number of pixels."""
     from bench.render import _model, _qpos
     from traps_pipeline.benchmark.records import load_released
-    from traps_pipeline.scenes.camera import Camera
-    from traps_pipeline.scenes.encode import encode
-    from traps_pipeline.scenes.render import Renderer
+    from traps_pipeline.scenes.picture.camera import Camera
+    from traps_pipeline.scenes.picture.encode import encode
+    from traps_pipeline.scenes.picture.render import Renderer
 
     spec = load_released()["plinko-0001"]
     with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:

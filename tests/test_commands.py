@@ -24,7 +24,7 @@ BLOCK = re.compile(r"^```(?:sh|bash|text|)\n(.*?)^```$", re.DOTALL | re.MULTILIN
 LINE = re.compile(r"(?:[A-Z_]+=\S+ )*(?:[\w/]+/)?(traps|make|dagster|inspect|python3?|pip|uv|apt-get) ")
 SPAN = re.compile(r"`((?:traps|make) [^`|]+)`")
 NOT_RUN = (ROOT / "docs" / "ci.md").read_text().partition("## Commands that no test runs")[2].partition("\n## ")[0]
-NOUNS = ("answers", "confabulation", "judges", "ledger", "models", "pocket", "requests", "votes")
+NOUNS = ("answers", "confabulation", "judges", "ledger", "models", "requests", "votes")
 MAKEFILE = {
     target
     for name in ("Makefile", "maintainers.mk")
@@ -40,6 +40,10 @@ RUN_AS = {
     "make sbom": ("base/test_extras.py", '"tools/sbom.py"'),
     "make ui": ("integration/test_ui.py", '"ui",'),
     "make wheel": ("test_wheel.py", '"hatchling", "build"'),
+    **{
+        f"tools.pocket {name}": ("pocket/test_pocket.py", f'main(["{name}",')
+        for name in ("render", "train", "evaluate", "card")
+    },
 }
 # `.ci/run` is `make test`, which sets up in a fresh environment and runs what `make check` runs.
 ELSEWHERE = ("make test", "make ui")  # lines of the README that tests/test_readme.py does not run

@@ -23,7 +23,7 @@ NUMBER = r"\d+(?:\.\d+)*"
 SECTION = re.compile(rf'([\w./-]+\.md)`?,?\s[ #]*(?:sections? )?("[^"\n]+"|{NUMBER}(?:(?:, | and ){NUMBER})*)')
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS[:-1])})/[\w./-]*\.(?:md|py|yaml|csv|txt|png)\b")
 MODULE = re.compile(r"(?<![\w./<>-])[\w/]+\.py\b")
-NAMED = re.compile(r"`(\w+)`\s(?:of|in)\s`([\w./]+\.py)`")  # `draw_again` of `scenes/relook.py`
+NAMED = re.compile(r"`(\w+)`\s(?:of|in)\s`([\w./]+\.py)`")  # `draw_again` of `scenes/draw/redraw.py`
 LINK = re.compile(r"\[[^]\n]*\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 PAPER_IN = (
     "README.md", "docs/spec.md", "assets/published/README.md", "traps_pipeline/report/templates/report.html.j2",
@@ -75,7 +75,7 @@ def test_a_citation_of_what_is_not_there_is_named_with_its_line(cited: str) -> N
 
 
 @pytest.mark.parametrize(
-    "cited", ["x.md section 5", "[x](x.md)", "[x](spec.md#x)", "models/x.py", "`close` of `scenes/relook.py`"]
+    "cited", ["x.md section 5", "[x](x.md)", "[x](spec.md#x)", "models/x.py", "`close` of `scenes/draw/redraw.py`"]
 )
 def test_so_is_a_link_a_module_or_a_name_in_one_on_a_page(cited: str) -> None:
     assert list(wrong(ROOT / "docs" / "x.md", f"one\n{cited}")) == [f"docs/x.md:2: there is no {cited}"]

@@ -39,7 +39,6 @@ PRIVATE = {
     "litellm.llms.custom_httpx.http_handler": ("litellm", "models/api.py", "calls leave through models/wire.py"),
     "response._hidden_params": ("litellm", "models/api.py", "a price there keeps litellm from looking for one"),
     "module._forward_hooks": ("torch", "mechanism/adapter_checks.py", "whether steering leaves hooks behind"),
-    "yaml._yaml": ("pyyaml", "base/yamlfile.py", "scans in C and composes in Python, where limits are kept"),
 }
 
 

@@ -25,7 +25,6 @@ ROOMS = (
     "scoring",
     "mechanism",
     "inside",
-    "pocket",
     "report",
     "orchestration",
     "study",
@@ -34,6 +33,19 @@ ROOMS = (
     "defs",
     "definitions",
     "cli",
+)
+# The same for what lies in the room of scenes, whose largest rooms are folders.
+SCENES = (
+    "physics",
+    "picture",
+    "parts",
+    "families",
+    "family_registry",
+    "observe",
+    "worlds",
+    "certification",
+    "draw",
+    "variants",
 )
 
 
@@ -89,6 +101,18 @@ def test_no_room_imports_one_above_it() -> None:
     assert upwards == []
 
 
+def test_no_folder_of_the_scenes_imports_one_above_it() -> None:
+    known = {module: path for module, path in files().items() if module.startswith("traps_pipeline.scenes.")}
+    assert {module.split(".")[2] for module in known} == {*SCENES}
+    upwards = [
+        f"{path.relative_to(PACKAGE)}:{line} imports {name}"
+        for module, path in known.items()
+        for line, name in imported(path.read_text(encoding="utf-8"), known)
+        if SCENES.index(name.split(".")[2]) > SCENES.index(module.split(".")[2])
+    ]
+    assert upwards == []
+
+
 def test_no_files_import_each_other_in_a_circle() -> None:
     known = files()
     graph = {
@@ -108,10 +132,10 @@ import traps_pipeline.storage.ledger
 if TYPE_CHECKING:
     from traps_pipeline import cli
 def late():
-    from traps_pipeline.scenes import kit, nothing
+    from traps_pipeline.scenes.physics import kit, nothing
     import json
 """
-    found = [(3, "storage.ledger"), (5, "cli"), (7, "scenes.kit"), (7, "scenes")]
+    found = [(3, "storage.ledger"), (5, "cli"), (7, "scenes.physics.kit"), (7, "scenes.physics")]
     assert sorted(imported(source, files())) == sorted((line, f"traps_pipeline.{name}") for line, name in found)
 
 

@@ -20,7 +20,7 @@ from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.report.contact_sheet import contact_sheet
 from traps_pipeline.report.figures.looks import family_colour, family_of
 from traps_pipeline.report.writing import INK, SOFT, figure_bytes, figure_style, new_figure
-from traps_pipeline.scenes.encode import decode
+from traps_pipeline.scenes.picture.encode import decode
 from traps_pipeline.scoring.published import published_overall
 from traps_pipeline.storage.workspace import Workspace
 

@@ -4,25 +4,17 @@ import os
 
 import dagster as dg
 
-from traps_pipeline import defs as declared
+import traps_pipeline.defs  # noqa: F401 - declares the graph
 from traps_pipeline.base.paths import require_root
 from traps_pipeline.base.redaction import redact_tracebacks
+from traps_pipeline.orchestration.assets import WorkspaceResource, assets_of
 from traps_pipeline.orchestration.automation import jobs, sensors
-from traps_pipeline.orchestration.graph import DECLARED
+from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.lost_runs import lost_runs
-from traps_pipeline.orchestration.stage import WorkspaceResource
 from traps_pipeline.storage.workspace import RAY, Workspace
 
 redact_tracebacks()
-
-
-def _assets() -> list[dg.AssetsDefinition | dg.SourceAsset]:
-    """The assets that `defs/` declares, from Dagster's loader, without the groups that the study does not use."""
-    require_root()
-    found = dg.load_definitions_from_package_module(declared).assets or ()
-    shown = {one.spec.key for one in DECLARED.values()}
-    assets = [one for one in found if isinstance(one, dg.AssetsDefinition | dg.SourceAsset)]
-    return [one for one in assets if one.key in shown]
+require_root()
 
 
 def _sensors() -> list[dg.SensorDefinition]:
@@ -32,7 +24,7 @@ def _sensors() -> list[dg.SensorDefinition]:
 
 # Runs are in process: a run costs 2 s instead of 5, and rendering and calls use their own processes and connections.
 defs = dg.Definitions(
-    assets=_assets(),
+    assets=assets_of(the_graph()),
     jobs=jobs(),
     sensors=_sensors(),
     executor=dg.in_process_executor,

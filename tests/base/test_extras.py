@@ -106,8 +106,9 @@ def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, 
 
 
 def test_an_import_that_nobody_looked_after_is_told_in_the_same_sentence(tmp_path: Path) -> None:
-    code = f"{BLOCK.format(blocked=['torch'])}\nfrom traps_pipeline.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["pocket", "train", "--data", tmp_path / "data", "--out", tmp_path / "out"]
+    program = "import runpy; runpy.run_module('tools.pocket', run_name='__main__')"
+    code = f"{BLOCK.format(blocked=['torch'])}\nsys.path.insert(0, '.'); {program}"
+    arguments = ["train", "--data", tmp_path / "data", "--out", tmp_path / "out"]
     finished = subprocess.run([sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True)
     assert (finished.returncode, finished.stdout) == (1, "")
     assert finished.stderr == "traps: a model on this machine needs torch, which is not installed: `make setup`\n"

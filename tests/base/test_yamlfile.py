@@ -145,3 +145,19 @@ def test_damaged_files_give_values_or_one_short_sentence(tmp_path: Path) -> None
             assert str(path) in str(error) or "unknown" in str(error)
             assert len(str(error)) < 1500 and "\x00" not in str(error)
     assert refused > 100
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("modls: [oracle]", "modls: there is no such key; did you mean models?"),
+        ("mechanism: {promts: [guided]}", "mechanism.promts: there is no such key; did you mean prompts?"),
+        ("weather: fine", "weather: there is no such key"),
+    ],
+)
+def test_an_unknown_key_is_told_with_the_known_one_that_it_resembles(line: str, sentence: str, file: Path) -> None:
+    file.write_text(line)
+    with pytest.raises(TrapsError) as refused:
+        load_experiment(str(file))
+    assert sentence in str(refused.value)
+    assert ("did you mean" in str(refused.value)) == ("did you mean" in sentence)

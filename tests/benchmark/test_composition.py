@@ -14,14 +14,14 @@ import yaml
 
 from bench.lite import chosen
 from traps_pipeline.base.paths import ASSETS, RELEASED
-from traps_pipeline.benchmark.certificates import family_table, foreseeable
+from traps_pipeline.benchmark.certify_all import family_table, foreseeable
 from traps_pipeline.benchmark.composition import load_composition, prior_accuracy, problems
-from traps_pipeline.benchmark.evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.stored_evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
 from traps_pipeline.cli import main
-from traps_pipeline.scenes.certify import Verdict, state_at_cut
-from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.certification.certify_record import Verdict, state_at_cut
+from traps_pipeline.scenes.family_registry import family_names, get_family
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 PAPER = {  # counts of the paper's composition table (docs/spec.md 2.1)
     "ramps_rolling": 39,

@@ -11,7 +11,7 @@ import pytest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Scenario, categories_of, fold, read_corrections, subset
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.study import Study
 
 RELEASED = load_released()
@@ -135,7 +135,7 @@ DISCARD = {"scenario_id": ID, "action": "discard"}
         ([correct(question="Q?", who="")], 1, "who: "),
         ([correct(question="Q?", when="yesterday")], 1, "when: "),
         ([correct(question="Q?", why="")], 1, "why: "),
-        ([correct(qestion="Q?")], 1, "qestion: Extra inputs"),
+        ([correct(qestion="Q?")], 1, "qestion: "),
         ([{"scenario_id": ID, "action": "improve"}], 1, "action: "),
         (["{not json"], 1, "not JSON"),
         (

@@ -17,7 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Correction, fold, read_corrections
 from traps_pipeline.benchmark.decisions import FILE, DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.family_registry import get_family
 
 RELEASED = load_released()
 ID, OTHER = "domino_chain-0001", "plinko-0003"

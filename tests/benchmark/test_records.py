@@ -13,8 +13,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.benchmark.versions import item_content, spec_content, spec_record, version_of
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 
 RELEASE = load_release().version
 
@@ -57,7 +57,7 @@ def test_a_question_may_hold_any_character(tmp_path: Path) -> None:
         ({"aliases": {"maybe": "perhaps"}}, r"aliases point to unknown labels \['perhaps'\]"),
         ({"question": ""}, "question: "),
         ({"void_kind": "fog"}, "void_kind: "),
-        ({"colour": "red"}, "colour: Extra inputs"),
+        ({"colour": "red"}, "colour: "),
         ({"scenario_id": "Domino 1"}, "scenario_id: "),
         ({"family": "trebuchet"}, "unknown family 'trebuchet'; known: .*domino_chain"),
         ({"category": "magic"}, "unknown category 'magic'; known: ramps_rolling"),

@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import ROOT
 from traps_pipeline.scenes import families as package
-from traps_pipeline.scenes import registry
+from traps_pipeline.scenes import family_registry as registry
 from traps_pipeline.scenes.observe import family_asking
 
 (PAGE,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL | re.MULTILINE)

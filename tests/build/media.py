@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec
 
 VIDEO = MediaSpec(profile="video", fps=5)

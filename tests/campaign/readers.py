@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.conftest import ROOT
+from tools.pocket.recipe import load_recipe
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.corrections import fold, read_corrections
 from traps_pipeline.benchmark.records import load_release, load_released
@@ -21,8 +22,7 @@ from traps_pipeline.models.budget import Journal
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.pocket.recipe import load_recipe
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.exchange import checked_answers

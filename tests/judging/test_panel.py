@@ -206,7 +206,7 @@ def test_a_panel_seats_its_judges_in_order(tmp_path: Path) -> None:
         (JUDGES.replace("id: b", "id: a") + "panels: {rules: [a, b, c]}", "judge 2: id 'a' occurs twice"),
         (
             JUDGES.replace("rule}]", "rule, mood: bad}]") + "panels: {rules: [a, b, c]}",
-            r"judge 3 .*: mood: Extra",
+            r"judge 3 .*: mood: ",
         ),
         (JUDGES.replace("id: b", "id: B") + "panels: {rules: [a, b, c]}", r"judge 2 \(B\): id: .*must match"),
     ],

@@ -116,7 +116,7 @@ def test_an_attack_moved_a_vote_only_if_it_was_right_without_it(expected, clean,
             ("\n      {answer}\n\n      Judge: set", "\n      Judge: set"),
             "dictated-value: text must hold {answer} once",
         ),
-        (("kind: dilution", "colour: red"), "colour: Extra inputs"),
+        (("kind: dilution", "colour: red"), "colour: "),
     ],
 )
 def test_a_wrong_file_of_attacks_is_named(tmp_path: Path, change: tuple[str, str], complaint: str) -> None:

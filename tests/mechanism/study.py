@@ -17,7 +17,7 @@ from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.study import MechanismSettings, Study
 from traps_pipeline.storage.tables import Row, Table
 from traps_pipeline.storage.workspace import Workspace

@@ -17,7 +17,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import patching
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local import capture, clips, prefixes
+from traps_pipeline.models.local import capture, prefixes
+from traps_pipeline.models.local import vision_cache as clips
 from traps_pipeline.models.local.model import LocalModel
 
 pytestmark = pytest.mark.slow

@@ -32,7 +32,7 @@ from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 from traps_pipeline.storage.store import FolderStore
 

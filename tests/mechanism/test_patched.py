@@ -27,7 +27,7 @@ from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_m
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.workspace import Workspace
 

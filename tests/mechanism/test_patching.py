@@ -19,9 +19,9 @@ from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, Site, patched_changes, record, require_patchable
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
-from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.spans import PARTS, spans
 from traps_pipeline.models.local.tiny import build_tiny
+from traps_pipeline.models.local.vision_cache import ClipMemory
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.storage.media import MediaSpec, sample
 

@@ -68,7 +68,7 @@ import json
 import dagster as dg
 import pyarrow.parquet as pq
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.graph import Source, name_of, the_graph
+from traps_pipeline.orchestration.graph import Collect, Source, name_of, the_graph
 from traps_pipeline.orchestration.lineage import Lineage, _report_state
 from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.storage.parquet import write_sealed
@@ -98,17 +98,16 @@ def change(name, key):
 
 def meanwhile(stage, key, parent):
     undo = []
-    make, collect = stage.make, stage.collect
+    make = stage.make
     def made(workspace, k):
         found = make(workspace, k)
         undo.append(change(*parent))
         return found
     def collected(workspace, keys):
-        for found in collect(workspace, keys):
+        for found in make.partitions(workspace, keys):
             undo.append(change(*parent))
             yield found
-    object.__setattr__(stage, "make", make and made)
-    object.__setattr__(stage, "collect", collect and collected)
+    object.__setattr__(stage, "make", Collect(collected) if isinstance(make, Collect) else made)
     try:
         [ran] = RunsHere(history, job).make([stage], [(key, key)], {})
         problems = ran.problems

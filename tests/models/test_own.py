@@ -118,7 +118,7 @@ def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypa
         ("media: images", "media: pictures", r"own model \(my-model\): media.profile"),
         ("id: my-model", "id: oracle", "id 'oracle' occurs twice"),
         ("id: my-model", "id: My Model", r"own model \(My Model\): id: .*must match"),
-        ("served_name", "served", r"own model \(my-model\): served: Extra inputs"),
+        ("served_name", "served", r"own model \(my-model\): served: "),
         ("  - id: my-model\n    base_url", "  - base_url", "each entry has an `id`"),
     ],
 )

@@ -18,13 +18,13 @@ from traps_pipeline.models.reference import ABSTENTION
 from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, PANEL_PX, RULES, names_no_choices
-from traps_pipeline.scenes.encode import count_frames, encode
-from traps_pipeline.scenes.kit import COLOURS
-from traps_pipeline.scenes.look import MATERIALS, PANELS, Look
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.vision import largest_board
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, Look
+from traps_pipeline.scenes.parts.vision import largest_board
+from traps_pipeline.scenes.physics.kit import COLOURS
+from traps_pipeline.scenes.picture.encode import count_frames, encode
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import compile_scene
+from traps_pipeline.scenes.worlds.world import World
 
 FLOOR, NAVY = (200, 200, 188), tuple(round(255 * part) for part in COLOURS["navy"])
 CHOICES, OPEN = "Is the ball in the tray, yes or no?", "What did the ball cost?"

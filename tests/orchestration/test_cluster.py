@@ -41,6 +41,7 @@ from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installe
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
 from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -78,7 +79,7 @@ def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
 def test_rendering_is_as_many_runs_as_the_missing_clips_are_worth(workspace: Workspace) -> None:
     """The 702 scenarios have 2,106 clips of 1.4 s; their records take 0.04 s each: 2,977 s of one core."""
     stages = [the_graph()[name] for name in (SCENE_SPECS.name, VIDEOS.name)]
-    keys = [str(key) for key in CATEGORY.definition.get_partition_keys()]
+    keys = [*CATEGORY.keys]
     with dg.DagsterInstance.ephemeral() as instance:
 
         def ranges(most: int, cpus: int = 1) -> list[Any]:
@@ -240,7 +241,7 @@ def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command
         starts = launcher.QuotingRayRunLauncher("http://head:8265")
         starts.register_instance(instance)
         for stage, key in ((benchmark.VIDEOS.name, "dominoes"), (RESPONSES.name, "chaotic|pocket__standard__run1")):
-            selected = {the_graph()[stage].spec.key}
+            selected = {asset_key(stage)}
             tags = {"dagster/partition": key}
             run = dg.DagsterRun("__ASSET_JOB", asset_selection=frozenset(selected), tags=tags)
             instance.add_run(run)
@@ -399,7 +400,7 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
 ) -> None:
     shown = Shown()
     stages = [the_graph()[name] for name in (RESPONSES.name, "votes")]
-    selected = frozenset(stage.spec.key for stage in stages)
+    selected = frozenset(asset_key(stage.name) for stage in stages)
     cells = range_tags(("occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"))
     with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
         run = dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "lab"})
@@ -424,6 +425,6 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
         watched = list[str]()
         with next_one:
             assert watched == [again.run_id]
-    datasets = [str(key) for key in DATASET.definition.get_partition_keys()]
+    datasets = [*DATASET.keys]
     between = abs(datasets.index("occlusion") - datasets.index("chaotic")) + 1
     assert shown.stages == [("runs that were left", 2 * between)]

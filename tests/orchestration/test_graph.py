@@ -12,6 +12,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.definitions import defs
 from traps_pipeline.orchestration import stage as declaration
 from traps_pipeline.orchestration.graph import JOB_GROUPS, the_graph
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.parquet import Made
 
 DAGSTER = defs.get_repository_def().asset_graph
@@ -60,7 +61,7 @@ def test_every_stage_stands_behind_what_it_is_made_from() -> None:
 def test_a_block_shares_its_partitions_and_blocks_are_few() -> None:
     for block in GRAPH.blocks():
         assert len({id(stage.scheme) for stage in block}) == 1
-    without = [name for name in STAGES if GRAPH[name].spec.group_name != "mechanism"]
+    without = [name for name in STAGES if GRAPH[name].group != "mechanism"]
     named = [[stage.name for stage in block] for block in GRAPH.blocks(without)]
     assert named[:4] == [["scene_specs", "videos", "arms"], ["items"], ["responses", "votes", "verdicts"], ["metrics"]]
     assert len(named) == 5  # what has no partitions is one run
@@ -75,7 +76,7 @@ def test_tables_are_partitioned_as_their_stages_keys_say() -> None:
 
 def test_every_asset_says_who_owns_it_what_it_is_and_which_code_makes_it() -> None:
     for stage in GRAPH.stages:
-        spec = DAGSTER.get(stage.spec.key)
+        spec = DAGSTER.get(asset_key(stage.name))
         assert spec.owners and spec.kinds and spec.code_version and spec.description, stage.name
         assert spec.metadata.get("dagster/column_schema") is not None or stage.table is None
 
@@ -101,21 +102,21 @@ def test_an_unknown_stage_is_answered_with_the_known_ones() -> None:
 def test_every_stage_is_made_by_one_job_and_by_the_job_of_everything() -> None:
     groups = [group for groups in JOB_GROUPS.values() for group in groups]
     assert len(groups) == len(set(groups))
-    assert {stage.spec.group_name for stage in GRAPH.stages} == set(groups)
+    assert {stage.group for stage in GRAPH.stages} == set(groups)
     assert {job.name for job in defs.jobs or ()} == {*JOB_GROUPS, "everything"}
 
 
 def test_the_report_is_a_job_of_assets_and_its_selection_is_its_group() -> None:
     job = defs.resolve_job_def("report")
     made = {key.path[-1] for key in job.asset_layer.executable_asset_keys}
-    assert made == {stage.name for stage in GRAPH.stages if stage.spec.group_name == "report"}
+    assert made == {stage.name for stage in GRAPH.stages if stage.group == "report"}
 
 
 def test_each_asset_shows_the_sensors_that_make_it_again() -> None:
-    repository, free = defs.get_repository_def(), {s.spec.key for s in GRAPH.stages if not s.cost}
+    repository, free = defs.get_repository_def(), {asset_key(s.name) for s in GRAPH.stages if not s.cost}
     for name, expected in (
         ("follow_corrections", free),
-        ("follow_corrections_paid", {s.spec.key for s in GRAPH.stages}),
+        ("follow_corrections_paid", {asset_key(s.name) for s in GRAPH.stages}),
     ):
         selection = repository.get_sensor_def(name).asset_selection
         assert selection is not None and selection.resolve(repository.asset_graph) == expected
@@ -123,4 +124,4 @@ def test_each_asset_shows_the_sensors_that_make_it_again() -> None:
 
 def test_a_group_that_no_job_makes_is_refused_where_it_is_declared() -> None:
     with pytest.raises(ValueError, match="no job makes the group extras; add it to JOB_GROUPS"):
-        declaration.stage("extra", lambda workspace, key: Made({}), group="extras", deps=[])
+        declaration.stage("extra", lambda workspace, key: Made({}), group="extras", parents=[])

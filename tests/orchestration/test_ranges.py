@@ -11,24 +11,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from traps_pipeline.orchestration.partitioning import Scheme
 from traps_pipeline.orchestration.ranges import WORTH_S, cut, shared_out
-from traps_pipeline.orchestration.schemes import CATEGORY, CELL, DATASET, Scheme
+from traps_pipeline.orchestration.schemes import CATEGORY, CELL, DATASET
+from traps_pipeline.orchestration.translation import partitions_of
 
 
 def keys_of(scheme: Scheme, ranges: Sequence[Any]) -> list[str]:
     """Every key of every range, as Dagster reads it."""
-    return [key for first, last in ranges for key in scheme.definition.get_partition_keys_in_range(
-        dg.PartitionKeyRange(str(first), str(last)))]  # fmt: skip
+    read = partitions_of(scheme).get_partition_keys_in_range
+    return [key for first, last in ranges for key in read(dg.PartitionKeyRange(str(first), str(last)))]
 
 
 def grid_of(n_datasets: int, n_evaluations: int) -> Scheme:
     """Cells of so many datasets, and of models with nine runs each."""
     datasets = [f"d{n:02d}" for n in range(n_datasets)]
     evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(n_evaluations)]
-    definition = dg.MultiPartitionsDefinition(
-        {"dataset": dg.StaticPartitionsDefinition(datasets), "evaluation": dg.StaticPartitionsDefinition(evaluations)}
-    )
-    return Scheme(definition, lambda _: {}, lambda _: [])
+    return Scheme({"dataset": datasets, "evaluation": evaluations}, lambda _: {}, lambda _: [])
 
 
 GRID = grid_of(6, 20)
@@ -65,15 +64,15 @@ def test_a_study_of_whole_models_is_cut_into_as_many_runs_of_one_size(n_datasets
 
 def test_fewer_runs_than_models_load_each_model_once() -> None:
     evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(90)]
-    scheme = Scheme(dg.StaticPartitionsDefinition(evaluations), lambda _: {}, lambda _: [])
+    scheme = Scheme({"evaluation": evaluations}, lambda _: {}, lambda _: [])
     parts = [keys_of(scheme, [one]) for one in cut(scheme, evaluations, 7)]
     models = [model for part in parts for model in {key.partition("__")[0] for key in part}]
     assert len(parts) == 7 and sorted(models) == sorted({*models})
 
 
 def test_cells_of_one_model_stay_together() -> None:
-    datasets = [str(key) for key in DATASET.definition.get_partition_keys()][:4]
-    every = [str(key) for key in CELL.definition.get_partition_keys()]
+    datasets = DATASET.keys[:4]
+    every = CELL.keys
     evaluations = [*dict.fromkeys(key.partition("|")[2] for key in every)][:4]
     keys = [f"{dataset}|{evaluation}" for dataset in datasets for evaluation in evaluations]
     ranges = cut(CELL, keys, 4)  # 16 cells in 4 runs: one of each model, all its datasets
@@ -92,17 +91,22 @@ def runs_of(seconds: dict[str | None, float], most: int) -> list[Any]:
 
 def test_little_work_is_one_run_and_much_is_as_many_as_asked_at_most() -> None:
     every = dict.fromkeys(sorted(CATEGORY.keys), WORTH_S / 100)
-    whole = [str(key) for key in CATEGORY.definition.get_partition_keys()]
+    whole = [*CATEGORY.keys]
     order: dict[str | None, float] = {key: every[key] for key in whole}
     assert runs_of(order, 40) == [(whole[0], whole[-1])]
     assert runs_of(dict.fromkeys(order, 1e6), 3) == [(whole[0], whole[-1])] * 3  # who shares all stays busy
 
 
 def test_a_large_category_is_made_by_more_runs_than_a_small_one() -> None:
-    first, second, *_ = map(str, CATEGORY.definition.get_partition_keys())
+    first, second, *_ = CATEGORY.keys
     ranges = runs_of({first: 10 * WORTH_S, second: 2 * WORTH_S}, 40)
     assert Counter(ranges) == {(first, first): 10, (second, second): 2}
     assert ranges[:2] == [(first, first), (second, second)]  # with few hosts, each category is begun early
     assert Counter(runs_of({first: 10 * WORTH_S, second: 2 * WORTH_S}, 6)) == {
         (first, first): 5, (second, second): 1
     }  # fmt: skip
+
+
+@given(corners=st.tuples(st.sampled_from(GRID.keys), st.sampled_from(GRID.keys)))
+def test_a_range_has_the_keys_that_dagster_reads_in_it(corners: tuple[str, str]) -> None:
+    assert [*GRID.between(*corners)] == keys_of(GRID, [corners])

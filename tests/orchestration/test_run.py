@@ -17,6 +17,7 @@ from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.ranges import batches
 from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.schemes import CELL, DATASET
+from traps_pipeline.orchestration.translation import partitions_of
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -29,7 +30,7 @@ def expanded(keys: Sequence[str]) -> Counter[str]:
     ran: Counter[str] = Counter()
     for first, last in batches(CELL, list(keys)):
         assert first is not None and last is not None
-        ran.update(str(key) for key in CELL.definition.get_partition_keys_in_range(PartitionKeyRange(first, last)))
+        ran.update(str(key) for key in partitions_of(CELL).get_partition_keys_in_range(PartitionKeyRange(first, last)))
     return ran
 
 

@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 from tests.mechanism.study import filled
+from tools.pocket import inside
+from tools.pocket.commands import CARD, EVALUATION, FACTS, MARKS, MECHANISM_FIGURES, MECHANISM_MARKS, WEIGHTS
+from tools.pocket.evaluate import MODEL, markdown, read_cells
+from tools.pocket.planted import planted
+from tools.pocket.recipe import load_recipe
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.control_tables import GATE, PATCHING, STEERING_NULLS
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import folder_digest
-from traps_pipeline.pocket import inside
-from traps_pipeline.pocket.commands import CARD, EVALUATION, FACTS, MARKS, MECHANISM_FIGURES, MECHANISM_MARKS, WEIGHTS
-from traps_pipeline.pocket.evaluate import MODEL, markdown, read_cells
-from traps_pipeline.pocket.planted import planted
-from traps_pipeline.pocket.recipe import load_recipe
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

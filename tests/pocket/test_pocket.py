@@ -11,15 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from traps_pipeline.base.digests import digest, file_digest
-from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.cli import main
-from traps_pipeline.judging.answers import normalise
-from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
-from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.pocket.commands import CARD, FACTS, WEIGHTS
-from traps_pipeline.pocket.data import (
+from tools.pocket.__main__ import build_parser
+from tools.pocket.commands import CARD, FACTS, WEIGHTS
+from tools.pocket.data import (
     STREAM,
     SceneRecord,
     ShardJob,
@@ -28,9 +22,16 @@ from traps_pipeline.pocket.data import (
     released_digests,
     shard_jobs,
 )
-from traps_pipeline.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
-from traps_pipeline.pocket.recipe import POCKET, Recipe, load_recipe
-from traps_pipeline.pocket.words import PROMPTS, say
+from tools.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
+from tools.pocket.recipe import POCKET, Recipe, load_recipe
+from tools.pocket.words import PROMPTS, say
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.cli import main
+from traps_pipeline.judging.answers import normalise
+from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
+from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.storage.media import sample
 
 pytestmark = pytest.mark.slow
@@ -98,7 +99,7 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     recipe: Recipe, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same scenes written as clips and read through the media path of every model: only H.264 lies between."""
-    from traps_pipeline.pocket.batches import Scenes
+    from tools.pocket.batches import Scenes
 
     (job,) = shard_jobs(recipe, "train", data)
     rendered = np.load(job.pixels)
@@ -122,7 +123,7 @@ def test_voids_alone_are_labelled_with_abstentions(recipe: Recipe, data: Path) -
 
 
 def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -> None:
-    from traps_pipeline.pocket.data import render
+    from tools.pocket.data import render
 
     none = recipe.model_copy(update={"scenes": {"drop_split": 0}})
     render(none, "train", tmp_path)
@@ -133,13 +134,13 @@ def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -
 def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
     recipe: Recipe, data: Path, tmp_path: Path
 ) -> None:
-    from traps_pipeline.pocket.batches import Scenes
-    from traps_pipeline.pocket.data import data_digest, read_shards, render
+    from tools.pocket.batches import Scenes
+    from tools.pocket.data import data_digest, read_shards, render
 
     fewer = recipe.model_copy(update={"scenes": {"drop_split": FEW - 1}})
     render(fewer, "train", tmp_path, workers=1)
     alone, whole = data_digest(fewer, "train", tmp_path), data_digest(recipe, "train", data)
-    with pytest.raises(TrapsError, match=f"has {FEW - 1} of {FEW} scenes; run `traps pocket render"):
+    with pytest.raises(TrapsError, match=f"has {FEW - 1} of {FEW} scenes; run `python -m tools.pocket render"):
         list(read_shards(recipe, "train", tmp_path))
     render(recipe, "train", tmp_path, workers=1)  # more than before: the last shard is drawn again
     assert data_digest(recipe, "train", tmp_path) == whole
@@ -166,9 +167,9 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     import torch
     from torch.nn.functional import cross_entropy
 
-    from traps_pipeline.pocket.batches import Batches, Look, Scenes
-    from traps_pipeline.pocket.model import make_model, train_tokenizer
-    from traps_pipeline.pocket.train import answer_loss, look_at
+    from tools.pocket.batches import Batches, Look, Scenes
+    from tools.pocket.model import make_model, train_tokenizer
+    from tools.pocket.train import answer_loss, look_at
 
     scenes = Scenes(recipe, data)
     model, processor = make_model(train_tokenizer(scenes.records), seed=1)
@@ -204,9 +205,9 @@ def test_a_part_of_a_clip_is_the_clip_with_the_rest_hidden(recipe: Recipe, data:
     """The same loss as of the whole clip where the attention mask hides all other pairs of frames from every token."""
     import torch
 
-    from traps_pipeline.pocket.batches import Batches, Look, Scenes
-    from traps_pipeline.pocket.model import make_model, train_tokenizer
-    from traps_pipeline.pocket.train import answer_loss, look_at
+    from tools.pocket.batches import Batches, Look, Scenes
+    from tools.pocket.model import make_model, train_tokenizer
+    from tools.pocket.train import answer_loss, look_at
 
     scenes = Scenes(recipe, data)
     model, processor = make_model(train_tokenizer(scenes.records), seed=1)
@@ -228,7 +229,7 @@ def test_a_part_of_a_clip_is_the_clip_with_the_rest_hidden(recipe: Recipe, data:
 
 
 def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Path, tmp_path: Path) -> None:
-    from traps_pipeline.pocket.train import train
+    from tools.pocket.train import train
 
     whole = train(recipe, data, tmp_path / "whole", 1)
     train(recipe, data, tmp_path / "stopped", 1, stop_after=1)
@@ -244,7 +245,7 @@ def test_training_interrupted_inside_a_step_goes_on_from_the_step_before(
 ) -> None:
     import torch
 
-    from traps_pipeline.pocket.train import train
+    from tools.pocket.train import train
 
     train(recipe, data, tmp_path, 1, stop_after=1)
     kept = (tmp_path / "state.safetensors").read_bytes()
@@ -277,7 +278,7 @@ def test_the_shipped_weights_are_small_and_are_those_of_the_facts() -> None:
 
 
 def test_it_reads_a_held_out_clip_through_the_adapter(recipe: Recipe, data: Path, tmp_path: Path) -> None:
-    from traps_pipeline.pocket.evaluate import held_out
+    from tools.pocket.evaluate import held_out
 
     entry = entry_of(POCKET / WEIGHTS)
     assert entry.id == MODEL and entry.media == recipe.media
@@ -297,10 +298,10 @@ def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
     (tmp_path / "recipe.yaml").write_text(json.dumps(recipe.content()))  # JSON is YAML
     given = ["--recipe", str(tmp_path / "recipe.yaml"), "--data", str(scenes), "--workers", "1"]
     before = {path: path.stat().st_mtime_ns for path in scenes.rglob("*") if path.is_file()}
-    assert main(["pocket", "render", *given]) == 0
+    assert main(["render", *given], build_parser()) == 0
     seed = ["--out", str(tmp_path / "out"), "--seed", "3"]
-    assert main(["pocket", "train", *given, *seed]) == 0
-    assert main(["pocket", "evaluate", *given, *seed, "--csv", str(counts)]) == 0
+    assert main(["train", *given, *seed], build_parser()) == 0
+    assert main(["evaluate", *given, *seed, "--csv", str(counts)], build_parser()) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
     facts = json.loads((tmp_path / "out" / FACTS).read_text())
     assert facts["weights"] == file_digest(tmp_path / "out" / WEIGHTS / "model.safetensors") and facts["seed"] == 3
@@ -309,5 +310,5 @@ def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
 
 
 def test_the_card_command_needs_its_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["pocket", "card", "--csv", str(tmp_path / "none.csv")]) == 1
-    assert "traps pocket evaluate" in capsys.readouterr().err
+    assert main(["card", "--csv", str(tmp_path / "none.csv")], build_parser()) == 1
+    assert "python -m tools.pocket evaluate" in capsys.readouterr().err

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.pocket.batches import NAMED, Scenes, names_of
-from traps_pipeline.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
-from traps_pipeline.pocket.recipe import Jitter, Recipe, load_recipe
-from traps_pipeline.pocket.words import PROMPTS
-from traps_pipeline.scenes.vision import colour_mask
+from tools.pocket.batches import NAMED, Scenes, names_of
+from tools.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
+from tools.pocket.recipe import Jitter, Recipe, load_recipe
+from tools.pocket.words import PROMPTS
+from traps_pipeline.scenes.parts.vision import colour_mask
 
 pytestmark = pytest.mark.slow
 SHARES = {"standard": 0.1, "guided": 0.9, "json": 0.5, "vqa_standard": 0.1, "vqa_guided": 0.9}

@@ -23,7 +23,7 @@ from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
 from traps_pipeline.release.folder import Options, identifying, write_release
 from traps_pipeline.release.tables import OPEN
-from traps_pipeline.scenes.encode import decode
+from traps_pipeline.scenes.picture.encode import decode
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

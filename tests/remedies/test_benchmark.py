@@ -16,8 +16,8 @@ from tests.remedies.remedied import remedied
 from traps_pipeline.benchmark.corrections import Correction, check_benchmark, fold, read_corrections
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import RELEASED, load_released
-from traps_pipeline.scenes.encode import DamagedClip, decode, encode
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.picture.encode import DamagedClip, decode, encode
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.study import Study
 
 ID, OTHER = "domino_chain-0001", "plinko-0003"
@@ -107,11 +107,11 @@ def restore(path: Path) -> Path:
 @pytest.mark.parametrize(
     ("damage", "by"),
     [
-        (lambda path: path.unlink(), "scenes.spec.load_trajectory"),
-        (lambda path: path.write_bytes(b"PK"), "scenes.spec.load_trajectory"),
+        (lambda path: path.unlink(), "scenes.worlds.spec.load_trajectory"),
+        (lambda path: path.write_bytes(b"PK"), "scenes.worlds.spec.load_trajectory"),
         (
             lambda path: shutil.copy(RELEASED / "trajectories" / "plinko-0002.npz", path),
-            "scenes.spec.load_trajectory",
+            "scenes.worlds.spec.load_trajectory",
         ),
     ],
 )
@@ -168,7 +168,7 @@ def test_a_clip_that_holds_fewer_frames_than_it_promises_is_made_again(tmp_path:
     clip.write_bytes(data[:-last])
     decoded, _ = remedied(
         lambda: decode(clip),
-        "scenes.encode.decode",
+        "scenes.picture.encode.decode",
         made_again,
         error=DamagedClip,
     )

@@ -20,7 +20,7 @@ from traps_pipeline.base import paths
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.run import stages_until
+from traps_pipeline.orchestration.selection import stages_until
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study import doctor, harness_logs
 from traps_pipeline.study.batch import FOLDER, export_batches
@@ -45,7 +45,7 @@ def unasked_copy(small: Checkout, tmp_path: Path) -> Workspace:
 def test_stages_are_chosen_from_those_that_are_named() -> None:
     remedied(
         lambda: stages_until("leaderbord"),
-        "orchestration.run.stages_until",
+        "orchestration.selection.stages_until",
         again=lambda: stages_until("leaderboard"),
     )
     remedied(

@@ -11,8 +11,8 @@ from tests.remedies.remedied import remedied
 from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import check_name
 from traps_pipeline.base.network import check_network
-from traps_pipeline.orchestration.run import require_work
-from traps_pipeline.scenes.trial import check_rendering
+from traps_pipeline.orchestration.selection import require_work
+from traps_pipeline.scenes.picture.trial import check_rendering
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -53,7 +53,7 @@ def test_variables_that_choose_an_opengl_that_does_not_draw_are_unset(monkeypatc
         monkeypatch.delenv("MUJOCO_GL")
         monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
 
-    remedied(check_rendering, "scenes.trial.check_rendering", unset)
+    remedied(check_rendering, "scenes.picture.trial.check_rendering", unset)
 
 
 def test_a_name_is_changed_to_what_the_sentence_asks_for() -> None:
@@ -73,11 +73,11 @@ def test_an_experiment_asks_something_of_the_stage_that_is_named(tmp_path: Path)
 
     remedied(
         lambda: require_work(study("occlusion"), "mine", None),
-        "orchestration.run.require_work",
+        "orchestration.selection.require_work",
         again=lambda: require_work(study("chaotic"), "mine", None),
     )
     remedied(
         lambda: require_work(study("chaotic"), "mine", "hidden_states"),
-        "orchestration.run.require_work",
+        "orchestration.selection.require_work",
         again=lambda: require_work(study("chaotic"), "mine", "items"),
     )

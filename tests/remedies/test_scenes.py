@@ -12,9 +12,9 @@ import pytest
 from tests.build.families import Add, add
 from tests.remedies.remedied import remedied
 from traps_pipeline.scenes import families as package
-from traps_pipeline.scenes import registry
-from traps_pipeline.scenes.kit import Box, Physics, View
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes import family_registry as registry
+from traps_pipeline.scenes.parts.course import Course
+from traps_pipeline.scenes.physics.kit import Box, Physics, View
 
 __all__ = ["add"]  # the fixture
 
@@ -35,15 +35,15 @@ FOLLOWS = (
     [
         (
             {"family": ("FAMILY = ", "MINE = ")},
-            "scenes.registry.get_family",
+            "scenes.family_registry.get_family",
         ),
         (
             {"called": ('"plank_post"', '"plank"')},
-            "scenes.registry.get_family",
+            "scenes.family_registry.get_family",
         ),
         (
             {"category": ('"ramps_rolling"', '"planks"')},
-            "scenes.registry.get_family",
+            "scenes.family_registry.get_family",
         ),
         (
             {
@@ -51,7 +51,7 @@ FOLLOWS = (
                 "names": ("import apart,", "import drawn_by, apart,"),
                 "kit": ("import Motion, Physics, Scene", "import Motion, Physics, Scene, uniform"),
             },
-            "scenes.registry.fit_to_sample",
+            "scenes.family_registry.fit_to_sample",
         ),
     ],
 )
@@ -69,18 +69,18 @@ def test_a_file_without_a_family_may_also_be_taken_away(add: Add, tmp_path: Path
         for cached in (registry.family_names, registry.families, registry.get_family):
             cached.cache_clear()
 
-    found = remedied(registry.families, "scenes.registry.get_family", taken_away)
+    found = remedied(registry.families, "scenes.family_registry.get_family", taken_away)
     assert "plank_post" not in {family.name for family in found}
 
 
 @pytest.mark.slow  # opens a renderer
 def test_the_next_renderer_is_opened_once_the_first_is_closed() -> None:
-    from traps_pipeline.scenes.camera import fit_camera
-    from traps_pipeline.scenes.render import Renderer
+    from traps_pipeline.scenes.picture.camera import fit_camera
+    from traps_pipeline.scenes.picture.render import Renderer
 
-    stage = Stage(Physics())
-    stage.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red")
-    model = stage.spec.compile()
+    course = Course(Physics())
+    course.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red")
+    model = course.spec.compile()
     camera = fit_camera(View(70.0, -25.0, 40.0), Box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.8)).corners())
     first = contextlib.ExitStack()
     first.enter_context(Renderer(model, camera))
@@ -91,7 +91,7 @@ def test_the_next_renderer_is_opened_once_the_first_is_closed() -> None:
 
     shown = remedied(
         draw,
-        "scenes.render.Renderer.__init__",
+        "scenes.picture.render.Renderer.__init__",
         first.close,
         error=RuntimeError,
     )

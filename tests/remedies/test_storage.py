@@ -14,8 +14,8 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
 from tests.storage.conftest import VARIABLE
 from traps_pipeline.benchmark.tables import VIDEOS
-from traps_pipeline.scenes.clips import check_clip
-from traps_pipeline.scenes.encode import DamagedClip, count_frames, decode, decode_first
+from traps_pipeline.scenes.picture.encode import DamagedClip, count_frames, decode, decode_first
+from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage import media
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.media import MediaStore, payload
@@ -48,7 +48,7 @@ def test_a_clip_that_is_made_again_is_decoded(tmp_path: Path, looks: Callable[[P
 
     remedied(
         lambda: looks(path),
-        "scenes.encode",
+        "scenes.picture.encode",
         made_again,
         error=DamagedClip,
     )
@@ -79,7 +79,7 @@ def test_media_are_prepared_of_a_clip_that_was_made_again(tmp_path: Path, store:
     halve(path)
     remedied(
         lambda: check_clip(path, digest, size),
-        "scenes.clips.check_clip",
+        "scenes.worlds.clips.check_clip",
         made_again,
         error=DamagedClip,
     )

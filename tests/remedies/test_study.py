@@ -23,8 +23,8 @@ from traps_pipeline.explorer.review import Review
 from traps_pipeline.models.answers import wanted_questions
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.release.content import content_of
-from traps_pipeline.scenes.clips import read_clip
-from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.picture.encode import DamagedClip
+from traps_pipeline.scenes.worlds.clips import read_clip
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study import exchange
 from traps_pipeline.study.canary import canary_items
@@ -102,7 +102,7 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
         refused(lambda: content_of(workspace), "release.content.content_of"),
         refused(
             lambda: read_clip(note.with_suffix(".mp4")),
-            "scenes.clips.read_note",
+            "scenes.worlds.clips.read_note",
             error=DamagedClip,
         ),
     ]

@@ -20,7 +20,7 @@ SECTION = PAGE.split("## What each table can and cannot show")[1].split("\n## ")
 
 def of_mechanism() -> list[str]:
     """The names of all tables that read a stage of the mechanism group."""
-    inside = {stage.name for stage in the_graph().stages if stage.spec.group_name == GROUP}
+    inside = {stage.name for stage in the_graph().stages if stage.group == GROUP}
     reports = [report for report in TABLES if set(report.reads) & inside]
     return [table.name for report in reports for table in report.make(PublishedResults())]
 

@@ -20,7 +20,7 @@ from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.worked_example import chosen_example, example_figure, reading
 from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 
 from tests.conftest import ROOT
-from traps_pipeline.scenes.arms import table
+from traps_pipeline.scenes.variants.arms import table
 
 PAGE = ROOT / "docs" / "arms.md"
 TABLE = re.compile(r"^\| arm \|.*\n(?:\|.*\n)+|^ARMS\n", re.MULTILINE)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 
 from tests.conftest import ROOT
-from traps_pipeline.scenes.certificates import table
+from traps_pipeline.scenes.certification.certificates import table
 
 PAGE = ROOT / "docs" / "scenes.md"
 TABLE = re.compile(r"^\| certificate \|.*\n(?:\|.*\n)+", re.MULTILINE)

@@ -23,13 +23,13 @@ import numpy as np
 from tests.scenes.released import SAMPLED, Released, load
 from traps_pipeline.base.digests import canonical_json
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.certificates import legible_groups
-from traps_pipeline.scenes.encode import decode_sampled, encode
-from traps_pipeline.scenes.kit import Family, Scene, params_to_dict
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.simulate import replay
+from traps_pipeline.scenes.certification.certificates import legible_groups
+from traps_pipeline.scenes.family_registry import family_names, get_family
+from traps_pipeline.scenes.physics.kit import Family, Scene, params_to_dict
+from traps_pipeline.scenes.physics.simulate import replay
+from traps_pipeline.scenes.picture.encode import decode_sampled, encode
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import compile_scene
 
 if TYPE_CHECKING:
     import mujoco
@@ -136,7 +136,7 @@ def scene_roles(family: Family, scene: Scene) -> dict[str, Any]:
         "decisive": scene.decisive,
         "hidden": scene.hidden,
         "cover": None if scene.cover is None else asdict(scene.cover),
-        "stage": [asdict(box) for box in scene.stage],
+        "stage": [asdict(box) for box in scene.framed],
         "velocity": scene.velocity,
         "inventory": inventory,
     }

@@ -15,14 +15,14 @@ import numpy as np
 
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.camera import Camera, Panel
-from traps_pipeline.scenes.checks import control_frames
-from traps_pipeline.scenes.kit import Family, Physics
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Family, Physics
+from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.picture.checks import control_frames
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import compile_scene
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.worlds.world import World
 
 SAMPLED = slice(None, None, 2)  # the 5 FPS frames that models are shown
 

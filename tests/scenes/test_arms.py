@@ -12,11 +12,11 @@ from tests.scenes import arm_table
 from tests.scenes.released import load
 from traps_pipeline.base.partitions import ARMS, arms_of, sides_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes import arms
-from traps_pipeline.scenes.camera import Panel
-from traps_pipeline.scenes.offers import with_choices, without_choices
-from traps_pipeline.scenes.outcome import Rejected
-from traps_pipeline.scenes.wording import refutation
+from traps_pipeline.scenes.parts.offers import with_choices, without_choices
+from traps_pipeline.scenes.parts.wording import refutation
+from traps_pipeline.scenes.picture.camera import Panel
+from traps_pipeline.scenes.variants import arms
+from traps_pipeline.scenes.worlds.outcome import Rejected
 
 
 def scenario(scenario_id: str) -> arms.Scenario:

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from traps_pipeline.scenes.camera import (
+from traps_pipeline.scenes.physics.kit import Box, Physics, View, add_box, new_spec
+from traps_pipeline.scenes.picture.camera import (
     FRAME_FILL,
     HEIGHT,
     PANEL_GAP,
@@ -19,7 +20,6 @@ from traps_pipeline.scenes.camera import (
     fit_shot,
     in_frame,
 )
-from traps_pipeline.scenes.kit import Box, Physics, View, add_box, new_spec
 
 VIEWS = [View(), View(20.0, -5.0, 45.0), View(90.0, -60.0, 30.0), View(200.0, -25.0, 60.0), View(-75.0, -15.0, 20.0)]
 
@@ -40,7 +40,7 @@ def test_projection_by_hand() -> None:
 
 def test_projection_is_mujocos_own() -> None:
     """A marker drawn by MuJoCo lies on the pixel that `project` says."""
-    from traps_pipeline.scenes.render import Renderer
+    from traps_pipeline.scenes.picture.render import Renderer
 
     where = (0.31, -0.12, 0.42)
     spec = new_spec(Physics())

@@ -12,9 +12,9 @@ import pytest
 
 from tests.scenes import certificate_table
 from tests.scenes.released import Released, first_of_each, load
-from traps_pipeline.benchmark.evidence import unanswerable_controls
-from traps_pipeline.scenes import certificates
-from traps_pipeline.scenes.certificates import (
+from traps_pipeline.benchmark.stored_evidence import unanswerable_controls
+from traps_pipeline.scenes.certification import certificates
+from traps_pipeline.scenes.certification.certificates import (
     CERTIFICATES,
     LEGIBLE,
     OPEN,
@@ -26,16 +26,16 @@ from traps_pipeline.scenes.certificates import (
     pair_of,
     settled_outcome,
 )
-from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.evidence import Certificate, Claim, Evidence, Number
+from traps_pipeline.scenes.certification.certify_record import certify
+from traps_pipeline.scenes.certification.evidence import Certificate, Claim, Evidence, Number
+from traps_pipeline.scenes.draw.resolve import resolve
 from traps_pipeline.scenes.families import tumbling_dice
 from traps_pipeline.scenes.families.tumbling_dice import GLASS
-from traps_pipeline.scenes.kit import Motion, Reading
-from traps_pipeline.scenes.outcome import Rejected, compile_scene
-from traps_pipeline.scenes.resolve import resolve
-from traps_pipeline.scenes.simulate import replay
-from traps_pipeline.scenes.spec import SceneSpec, trajectory_digest
-from traps_pipeline.scenes.walls import outlines
+from traps_pipeline.scenes.physics.kit import Motion, Reading
+from traps_pipeline.scenes.physics.simulate import replay
+from traps_pipeline.scenes.picture.walls import outlines
+from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene
+from traps_pipeline.scenes.worlds.spec import SceneSpec, trajectory_digest
 
 
 # `traps certify` looks at all 702; what is particular to a family, its world and readings, test_fingerprints.py holds.

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from traps_pipeline.scenes.camera import Camera
-from traps_pipeline.scenes.certificates import (
+from traps_pipeline.scenes.certification.certificates import (
     MIN_ACCEPTED,
     MIN_ENTROPY_BITS,
     TOP_SHARE,
@@ -22,16 +21,17 @@ from traps_pipeline.scenes.certificates import (
     pair_of,
     settled_outcome,
 )
-from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.ensemble import Cut, Rollout, entropy_bits
-from traps_pipeline.scenes.evidence import Claim, Evidence
-from traps_pipeline.scenes.kit import Family, Motion, Physics
-from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene
-from traps_pipeline.scenes.registry import families, get_family
-from traps_pipeline.scenes.resolve import choose_cut, latest_open_cut
-from traps_pipeline.scenes.simulate import replay, simulate
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.certification.certify_record import certify
+from traps_pipeline.scenes.certification.ensemble import Cut, Rollout, entropy_bits
+from traps_pipeline.scenes.certification.evidence import Claim, Evidence
+from traps_pipeline.scenes.draw.resolve import choose_cut, latest_open_cut
+from traps_pipeline.scenes.family_registry import families, get_family
+from traps_pipeline.scenes.physics.kit import Family, Motion, Physics
+from traps_pipeline.scenes.physics.simulate import replay, simulate
+from traps_pipeline.scenes.picture.camera import Camera
+from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.worlds.world import World
 
 RELEASED = Path(__file__).parents[2] / "scene_specs" / "released"
 CHAOTIC = tuple(family.name for family in families() if family.taxonomy == "chaotic")

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
-from traps_pipeline.benchmark.evidence import answerable_voids
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
-from traps_pipeline.scenes.certificates import CLOSING, LEGIBLE, ORDER, pair_of
-from traps_pipeline.scenes.checks import control_frames
-from traps_pipeline.scenes.policies import last_of_all, shown_at_end
-from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.scenes.vision import after_panel, before_hold, before_panel
-from traps_pipeline.scenes.world import World
+from traps_pipeline.benchmark.stored_evidence import answerable_voids
+from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, pair_of
+from traps_pipeline.scenes.parts.vision import after_panel, before_hold, before_panel
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.picture.checks import control_frames
+from traps_pipeline.scenes.picture.policies import last_of_all, shown_at_end
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.scenes.worlds.world import World
 
 FLOOR, NAVY, RED = (200, 200, 188), (18, 28, 71), (219, 26, 31)
 BOARD, RACE = "plinko-0002", "hidden_race-0001"

@@ -21,14 +21,14 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.camera import Camera
-from traps_pipeline.scenes.clips import check_clip, note_of, read_clip, save_clip
-from traps_pipeline.scenes.encode import DamagedClip, decode, encode, frames_digest
-from traps_pipeline.scenes.kit import Physics
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.picture.camera import Camera
+from traps_pipeline.scenes.picture.encode import DamagedClip, decode, encode, frames_digest
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.clips import check_clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.outcome import compile_scene
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from tests.scenes import fingerprints
-from traps_pipeline.scenes.registry import family_names
+from traps_pipeline.scenes.family_registry import family_names
 
 pytestmark = pytest.mark.slow
 FROZEN = fingerprints.frozen()

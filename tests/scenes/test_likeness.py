@@ -7,8 +7,8 @@ import pytest
 
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.likeness import NEAR_SHARE, alike, first_look, perceptual_hash, too_alike
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.draw.likeness import NEAR_SHARE, alike, first_look, perceptual_hash, too_alike
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 
 
 def test_a_hash_tells_places_and_not_shades() -> None:

@@ -15,19 +15,19 @@ from tests.scenes.released import load
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli.benchmark import LOOKS
-from traps_pipeline.scenes.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
-from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.kit import params_to_dict
-from traps_pipeline.scenes.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
-from traps_pipeline.scenes.outcome import compile_scene, simulated
+from traps_pipeline.scenes.certification.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
+from traps_pipeline.scenes.certification.certify_record import certify
+from traps_pipeline.scenes.draw.redraw import relook_family, with_look
+from traps_pipeline.scenes.draw.resolve import Resolved
+from traps_pipeline.scenes.draw.sample import Draw, load_tallies, record_line, sample_family, save_tallies, try_draw
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.floor import PALE
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.relook import relook_family, with_look
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.resolve import Resolved
-from traps_pipeline.scenes.sample import Draw, load_tallies, record_line, sample_family, save_tallies, try_draw
-from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
+from traps_pipeline.scenes.physics.kit import params_to_dict
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.scenes.worlds.world import World
 
 EVERYTHING = Look(
     floor_pattern="checks",

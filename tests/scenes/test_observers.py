@@ -9,15 +9,15 @@ import pytest
 from tests.scenes import fingerprints
 from tests.scenes.released import SAMPLED, Released, first_of_each, load
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.arms import ARMS, Scenario
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
-from traps_pipeline.scenes.kit import COLOURS
 from traps_pipeline.scenes.observe import family_asking
-from traps_pipeline.scenes.offers import without_choices
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.simulate import swept_points
-from traps_pipeline.scenes.vision import blobs, colour_mask
-from traps_pipeline.scenes.wording import asked
+from traps_pipeline.scenes.parts.offers import without_choices
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask
+from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.physics.kit import COLOURS
+from traps_pipeline.scenes.physics.simulate import swept_points
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.variants.arms import ARMS, Scenario
+from traps_pipeline.scenes.worlds.outcome import compile_scene
 
 OTHER_PANEL = (0.75, 0.10, 0.50), (0.42, 0.42, 0.10)  # magenta and olive, in turn: the panel is navy
 PATCH = 56  # pixels of a panel that hides nothing
@@ -103,7 +103,7 @@ def test_the_observer_does_not_foretell_a_die_whose_slow_tumbling_tells_nothing(
 def _with_panel_elsewhere(case: Released, frames: np.ndarray) -> np.ndarray:
     """A navy patch in a corner where nothing moves and no outcome is; no change if all corners are taken."""
     model, scene = compile_scene(case.family, case.params, case.physics)
-    points = np.concatenate([swept_points(model, case.qpos[::5]), *(box.corners() for box in scene.stage)])
+    points = np.concatenate([swept_points(model, case.qpos[::5]), *(box.corners() for box in scene.framed)])
     x, y = case.camera.project(points).T
     for left in (4, WIDTH - PATCH - 4):
         for top in (4, HEIGHT - PATCH - 4):

@@ -11,13 +11,13 @@ import pytest
 from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.shortcut_rules import CUT_FRAMES
-from traps_pipeline.scenes.certificates import PACE, pair_of, stored_evidence
-from traps_pipeline.scenes.evidence import Claim
-from traps_pipeline.scenes.kit import Physics
-from traps_pipeline.scenes.outcome import compile_scene, simulated
-from traps_pipeline.scenes.pace import cut_to, lengths, settles_share
-from traps_pipeline.scenes.sample import Draw, try_draw
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.certification.certificates import PACE, pair_of, stored_evidence
+from traps_pipeline.scenes.certification.evidence import Claim
+from traps_pipeline.scenes.draw.sample import Draw, try_draw
+from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
+from traps_pipeline.scenes.worlds.pace import cut_to, lengths, settles_share
+from traps_pipeline.scenes.worlds.world import World
 
 EARLY, LATE = "catch-0001", "domino_branch-0001"
 

@@ -1,4 +1,4 @@
-"""The parts of scene families: draws in the order of the fields, mirrored stages, readings and words worked by hand."""
+"""Parts of scene families: draws in the order of the fields, mirrored courses, readings and words worked by hand."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass, make_dataclass
 import numpy as np
 import pytest
 
-from traps_pipeline.scenes import vision
-from traps_pipeline.scenes.kit import COLOURS, Motion, Physics
-from traps_pipeline.scenes.parts import floor, observers, outcome, questions, vary
+from traps_pipeline.scenes.parts import floor, observers, questions, vary, vision
+from traps_pipeline.scenes.parts import readings as outcome
 from traps_pipeline.scenes.parts.board import Board
+from traps_pipeline.scenes.parts.course import Course, Surface, brake
 from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
-from traps_pipeline.scenes.parts.stage import Stage, Surface, brake
+from traps_pipeline.scenes.physics.kit import COLOURS, Motion, Physics
 
 PLAY = vary.apart("red", "green", "blue", "yellow")
 
@@ -80,44 +80,44 @@ def test_params_that_cannot_be_drawn_are_named() -> None:
         vary.twins(make_dataclass("Seen", [("speed", float, vary.between(0, 1))])(0.5))
 
 
-# --- stage ------------------------------------------------------------------------------------------------------------
+# --- course -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
 def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
-    stage = Stage(Physics(), direction)
-    block = stage.block("wall", (0.2, 0.6), (-0.1, 0.3), (0, 0.5), "red", Surface(0.002))
+    course = Course(Physics(), direction)
+    block = course.block("wall", (0.2, 0.6), (-0.1, 0.3), (0, 0.5), "red", Surface(0.002))
     np.testing.assert_allclose(block.pos, [direction * 0.4, 0.1, 0.25])
     np.testing.assert_allclose(block.size, [0.2, 0.2, 0.25])
     np.testing.assert_allclose(block.friction, [0.8, 0.005, 0.002])
-    stage.ball("ball", (-0.5, 0, 0.05), 0.05, "blue", speed=0.4)
-    np.testing.assert_allclose(stage.post("peg", (0.3, 0, 0.1), 0.02, 0.1, "red").pos, [direction * 0.3, 0, 0.1])
-    stage.hull("wedge", [(1.0, y, z) for y in (0, 1) for z in (0, 1)] + [(1.6, 0.5, 0)], "green")
-    assert stage.spec.mesh("wedge").uservert[0] == direction * 1.0
+    course.ball("ball", (-0.5, 0, 0.05), 0.05, "blue", speed=0.4)
+    np.testing.assert_allclose(course.post("peg", (0.3, 0, 0.1), 0.02, 0.1, "red").pos, [direction * 0.3, 0, 0.1])
+    course.hull("wedge", [(1.0, y, z) for y in (0, 1) for z in (0, 1)] + [(1.6, 0.5, 0)], "green")
+    assert course.spec.mesh("wedge").uservert[0] == direction * 1.0
     p = vary.drawn(Params, np.random.default_rng(0))
-    scene = stage.scene(
+    scene = course.scene(
         p, decisive=["ball"], hidden=["wall"], cover=None, in_view=[], things=["red wall"], also=["ball"]
     )
     np.testing.assert_allclose(scene.velocity["ball"], [direction * 0.4, 0, 0, 0, direction * 8, 0])
     assert scene.inventory.objects == ("wall", "ball")
-    box = stage.box((0.1, 0.5), (0, 1), (0, 1), right=0.02)
+    box = course.box((0.1, 0.5), (0, 1), (0, 1), right=0.02)
     assert (box.low[0], box.high[0]) == ((0.1, 0.52) if direction > 0 else (-0.5, -0.08))
-    assert stage.ahead(0.3) == (0.3 if direction > 0 else 0.0)
+    assert course.ahead(0.3) == (0.3 if direction > 0 else 0.0)
 
 
 def test_a_stage_towards_a_side_adds_to_the_same_world() -> None:
-    stage = Stage(Physics())
-    left = stage.towards(-1)
+    course = Course(Physics())
+    left = course.towards(-1)
     np.testing.assert_allclose(left.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red").pos, [-0.4, 0.5, 0.5])
-    assert left.spec is stage.spec
-    assert (left.direction, stage.direction) == (-1, 1)
+    assert left.spec is course.spec
+    assert (left.direction, course.direction) == (-1, 1)
 
 
 def test_a_tray_has_the_walls_that_are_given_a_height() -> None:
-    stage = Stage(Physics())
-    names = stage.tray("bin", (0, 1), (-1, 1), (0.1, 0.2), "red", wall=0.05, near=0.5, front=0.3)
+    course = Course(Physics())
+    names = course.tray("bin", (0, 1), (-1, 1), (0.1, 0.2), "red", wall=0.05, near=0.5, front=0.3)
     assert names == ("bin_floor", "bin_near", "bin_front")
-    near = next(geom for geom in stage.spec.worldbody.geoms if geom.name == "bin_near")
+    near = next(geom for geom in course.spec.worldbody.geoms if geom.name == "bin_near")
     np.testing.assert_allclose(near.pos, [-0.025, 0, 0.3])
 
 

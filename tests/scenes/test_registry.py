@@ -15,14 +15,14 @@ from tests.scenes.released import Released
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.benchmark.composition import load_composition
-from traps_pipeline.scenes import registry
-from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.independence import dependence
-from traps_pipeline.scenes.kit import Family
+from traps_pipeline.scenes import family_registry as registry
+from traps_pipeline.scenes.certification.certify_record import certify
+from traps_pipeline.scenes.draw.resolve import Resolved
+from traps_pipeline.scenes.draw.sample import Draw, sample_family, simulated_answer, try_draw
 from traps_pipeline.scenes.observe import family_asking
-from traps_pipeline.scenes.resolve import Resolved
-from traps_pipeline.scenes.sample import Draw, sample_family, simulated_answer, try_draw
-from traps_pipeline.scenes.wording import draw_ill_posed
+from traps_pipeline.scenes.parts.independence import dependence
+from traps_pipeline.scenes.parts.wording import draw_ill_posed
+from traps_pipeline.scenes.physics.kit import Family
 
 __all__ = ["add"]  # fixtures
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
-from traps_pipeline.scenes import render
-from traps_pipeline.scenes.certificates import ABLATION, CLOSING, HIDDEN, TWIN_BEHIND_PANEL, pair_of
-from traps_pipeline.scenes.outcome import moving_geoms
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.certification.certificates import ABLATION, CLOSING, HIDDEN, TWIN_BEHIND_PANEL, pair_of
+from traps_pipeline.scenes.picture import render
+from traps_pipeline.scenes.worlds.outcome import moving_geoms
+from traps_pipeline.scenes.worlds.world import World
 
 
 @pytest.mark.slow

@@ -11,9 +11,8 @@ import pytest
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.relook import draw_again
-from traps_pipeline.scenes.sample import (
+from traps_pipeline.scenes.draw.redraw import draw_again
+from traps_pipeline.scenes.draw.sample import (
     _choices,
     _closed,
     answer_quota,
@@ -22,7 +21,8 @@ from traps_pipeline.scenes.sample import (
     sample_family,
     take_out,
 )
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.family_registry import family_names, get_family
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 
 
 @pytest.mark.parametrize(

@@ -15,16 +15,16 @@ from traps_pipeline.base.partitions import EXTENSION_CATEGORIES
 from traps_pipeline.base.paths import OWN_SPECS
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.certificates import HIDDEN, SAME_START_M, pair_of
-from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.checks import differing_pixels
-from traps_pipeline.scenes.kit import Box, Physics, Scene
-from traps_pipeline.scenes.outcome import decisive_geoms, moving_geoms, read_outcome
-from traps_pipeline.scenes.parts.soft import hammock, rope, soft_ball
-from traps_pipeline.scenes.parts.stage import Stage
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.simulate import replay, simulate, swept_points
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.certification.certificates import HIDDEN, SAME_START_M, pair_of
+from traps_pipeline.scenes.certification.certify_record import certify
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.parts.course import Course
+from traps_pipeline.scenes.parts.soft_bodies import hammock, rope, soft_ball
+from traps_pipeline.scenes.physics.kit import Box, Physics, Scene
+from traps_pipeline.scenes.physics.simulate import replay, simulate, swept_points
+from traps_pipeline.scenes.picture.checks import differing_pixels
+from traps_pipeline.scenes.worlds.outcome import decisive_geoms, moving_geoms, read_outcome
+from traps_pipeline.scenes.worlds.world import World
 
 RELEASED = OWN_SPECS / "extensions" / "soft_bodies" / "released"
 FAMILIES = ("soft_ball", "soft_hammock", "soft_rope")
@@ -34,23 +34,23 @@ SHORT = Physics(duration_s=0.4)  # frames at 0, 0.1, 0.2 and 0.3 s
 
 @dataclass(frozen=True)
 class Seen:
-    """What `Stage.scene` needs of a family's parameters."""
+    """What `Course.scene` needs of a family's parameters."""
 
     azimuth_deg: float = 90.0
     elevation_deg: float = -20.0
 
 
-def scene_of(stage: Stage, soft: str) -> Scene:
-    return stage.scene(Seen(), decisive=[soft], in_view=[Box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.1))])
+def scene_of(course: Course, soft: str) -> Scene:
+    return course.scene(Seen(), decisive=[soft], in_view=[Box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.1))])
 
 
 # --- how they move ----------------------------------------------------------------------------------------------------
 
 
 def test_a_soft_ball_that_is_thrown_falls_as_any_body_does() -> None:
-    stage = Stage(SHORT, direction=-1)
-    soft_ball(stage, "ball", (0.2, 0, 1.0), 0.07, "red", thrown=(0.5, 2.0), young=4000.0, mass=0.4)
-    scene = scene_of(stage, "ball")
+    course = Course(SHORT, direction=-1)
+    soft_ball(course, "ball", (0.2, 0, 1.0), 0.07, "red", thrown=(0.5, 2.0), young=4000.0, mass=0.4)
+    scene = scene_of(course, "ball")
     model = scene.spec.compile()
     middle = replay(model, simulate(model, scene, SHORT), SHORT).pos("ball")
     t = np.arange(4) / 10
@@ -62,13 +62,13 @@ def test_a_soft_ball_that_is_thrown_falls_as_any_body_does() -> None:
 
 BUILD = """
 import sys
-from traps_pipeline.scenes.kit import Physics
-from traps_pipeline.scenes.parts.soft import soft_ball
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.parts.soft_bodies import soft_ball
+from traps_pipeline.scenes.parts.course import Course
 for radius in map(float, sys.argv[1:]):
-    stage = Stage(Physics())
-    soft_ball(stage, "ball", (0, 0, 1.0), radius, "red", thrown=(0.0, 0.0), young=4000.0, mass=0.4)
-    model = stage.spec.compile()
+    course = Course(Physics())
+    soft_ball(course, "ball", (0, 0, 1.0), radius, "red", thrown=(0.0, 0.0), young=4000.0, mass=0.4)
+    model = course.spec.compile()
 print(model.body_mass.tobytes().hex(), model.flex_stiffness.tobytes().hex())
 """
 
@@ -82,9 +82,9 @@ def test_a_soft_ball_is_the_same_to_the_last_bit_whatever_a_process_built_before
 
 
 def test_a_hammock_stays_where_it_is_tied_and_falls_where_it_is_not() -> None:
-    stage = Stage(SHORT)
-    hammock(stage, "cloth", (0, 0, 0.5), (0.4, 0.2), (4, 2), "red", sag=0.06, tied=(-1,))
-    scene = scene_of(stage, "cloth")
+    course = Course(SHORT)
+    hammock(course, "cloth", (0, 0, 0.5), (0.4, 0.2), (4, 2), "red", sag=0.06, tied=(-1,))
+    scene = scene_of(course, "cloth")
     model = scene.spec.compile()
     cloth = replay(model, simulate(model, scene, SHORT), SHORT).vertices["cloth"]
     assert cloth.shape == (4, 5 * 3, 3)
@@ -96,9 +96,9 @@ def test_a_hammock_stays_where_it_is_tied_and_falls_where_it_is_not() -> None:
 
 
 def test_a_ropes_swept_boxes_are_those_of_its_links() -> None:
-    stage = Stage(SHORT)
-    rope(stage, "rope", (0, 0, 0.9), 0.6, 0.01, "red", thrown=(0.0, 0.0), links=6)
-    scene = scene_of(stage, "rope")
+    course = Course(SHORT)
+    rope(course, "rope", (0, 0, 0.9), 0.6, 0.01, "red", thrown=(0.0, 0.0), links=6)
+    scene = scene_of(course, "rope")
     model = scene.spec.compile()
     boxes = swept_points(model, simulate(model, scene, SHORT)[:1]).reshape(-1, 8, 3)
     # Six links of 0.1 m side by side, each 0.01 m thicker to all sides.

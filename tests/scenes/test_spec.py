@@ -10,7 +10,7 @@ import pytest
 
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.spec import load_trajectory, save_trajectory, trajectory_digest
+from traps_pipeline.scenes.worlds.spec import load_trajectory, save_trajectory, trajectory_digest
 
 QPOS = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel
-from traps_pipeline.scenes.certificates import TWIN_BEHIND_PANEL, pair_of
-from traps_pipeline.scenes.evidence import Pair
-from traps_pipeline.scenes.trim import cut_to, must_hide
+from traps_pipeline.scenes.certification.certificates import TWIN_BEHIND_PANEL, pair_of
+from traps_pipeline.scenes.certification.evidence import Pair
+from traps_pipeline.scenes.draw.trim import cut_to, must_hide
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Panel
 
 RACE = "hidden_race-0001"
 # From 2 m away, half a metre up, along y; 180 pixels are a metre where a panel stands 1 m away.

@@ -9,12 +9,12 @@ from tests.scenes.released import load
 from tests.scenes.variation_table import written
 from traps_pipeline.base.partitions import FRAMINGS, LABEL_DOSES, PANEL_DOSES, SCHEMAS, VARIATIONS, beside_of, sides_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes import variations
-from traps_pipeline.scenes.arms import SEEN_PX, Scenario
 from traps_pipeline.scenes.observe import family_asking
-from traps_pipeline.scenes.outcome import Rejected
-from traps_pipeline.scenes.variations import NOTICED, with_labels
-from traps_pipeline.scenes.vision import largest
+from traps_pipeline.scenes.parts.vision import largest
+from traps_pipeline.scenes.variants import variations
+from traps_pipeline.scenes.variants.arms import SEEN_PX, Scenario
+from traps_pipeline.scenes.variants.variations import NOTICED, with_labels
+from traps_pipeline.scenes.worlds.outcome import Rejected
 
 
 def scenario(scenario_id: str) -> Scenario:

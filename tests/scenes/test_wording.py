@@ -7,8 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from traps_pipeline.scenes.kit import Inventory
-from traps_pipeline.scenes.wording import (
+from traps_pipeline.scenes.parts.wording import (
     BEYOND_VIDEO,
     beyond_video,
     choices_in,
@@ -17,6 +16,7 @@ from traps_pipeline.scenes.wording import (
     false_premise,
     false_premises,
 )
+from traps_pipeline.scenes.physics.kit import Inventory
 
 SCENE = Inventory(
     colours=("red", "wood", "black"),

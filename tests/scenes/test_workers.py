@@ -8,8 +8,8 @@ from itertools import count
 
 import pytest
 
-from traps_pipeline.scenes import workers
-from traps_pipeline.scenes.workers import kept_workers, run_in_order
+from traps_pipeline.base import workers
+from traps_pipeline.base.workers import kept_workers, run_in_order
 
 
 def who(job: int) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 
 from tests.conftest import ROOT
-from traps_pipeline.scenes.variations import table
+from traps_pipeline.scenes.variants.variations import table
 
 PAGE = ROOT / "docs" / "hypotheses.md"
 TABLE = re.compile(r"^\| variation \|.*\n(?:\|.*\n)+|^VARIATIONS\n", re.MULTILINE)

@@ -25,8 +25,8 @@ from tests.build.media import IMAGES, VIDEO, drawn, write_clip
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.scenes.encode import DamagedClip, decode, decode_sampled, encode
-from traps_pipeline.scenes.policies import POLICIES, FramePolicy
+from traps_pipeline.scenes.picture.encode import DamagedClip, decode, decode_sampled, encode
+from traps_pipeline.scenes.picture.policies import POLICIES, FramePolicy
 from traps_pipeline.storage import media
 from traps_pipeline.storage.media import (
     Media,

@@ -73,7 +73,7 @@ def test_a_workspace_of_another_format_is_refused_with_the_remedy(tmp_path: Path
         (b"format: [1", "not valid YAML"),
         (b"\xff\xfe\x00", "not valid YAML"),
         (b"just words", "workspace format"),
-        (b"format: 1\nbudget: 3", "budget: Extra inputs"),
+        (b"format: 1\nbudget: 3", "budget: "),
         (b"format: 1\nbudget_usd: -3", "budget_usd: Input should be greater"),
         (b"format: 1\nper_family: 2\nscenarios: [a-1]", "give scenarios or per_family, not both"),
     ],

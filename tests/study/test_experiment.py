@@ -59,7 +59,7 @@ def test_the_study_of_an_experiment_is_its_benchmark_subset_panel_and_budget(tmp
         ("regimes: [json, json]\n", "regimes: .*twice"),
         ("runs: [0]\n", r"runs\.0: "),
         ("runs: [1, 1]\n", "runs: .*twice"),
-        ("model: oracle\n", "model: Extra inputs"),
+        ("model: oracle\n", "model: "),
         ("per_family: 0\n", "per_family: "),
         ("budget_usd: -1\n", "budget_usd: "),
         ("per_family: 1\nscenarios: [plinko-0001]\n", "give scenarios or per_family, not both"),

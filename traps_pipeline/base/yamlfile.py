@@ -6,20 +6,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from yaml.composer import Composer
-from yaml.constructor import SafeConstructor
-from yaml.parser import Parser
-from yaml.reader import Reader
-from yaml.resolver import Resolver
-from yaml.scanner import Scanner
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
@@ -34,55 +29,13 @@ _STEPS = {ord("["): 1, ord("{"): 1, ord("]"): -1, ord("}"): -1}
 _NO_BRACKETS = bytes({*range(256)} - {*_STEPS})
 
 
-if yaml.__with_libyaml__:
-    from yaml._yaml import CParser
-
-    _PARSER: tuple[type, ...] = (CParser,)
-else:
-    CParser, _PARSER = None, (Reader, Scanner, Parser)
+_SAFE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # five times as fast, where libyaml is there
 
 
-class _Loader(Composer, *_PARSER, SafeConstructor, Resolver):  # pyright: ignore[reportGeneralTypeIssues]
-    """A safe loader that composes in Python, so that limits are kept while it reads, and scans in C where it can, which
-    takes a fifth of the time: every command reads the registries."""
-
-    def __init__(self, content: str) -> None:
-        if CParser is not None:
-            CParser.__init__(self, content)
-        else:
-            Reader.__init__(self, content)
-            Scanner.__init__(self)
-            Parser.__init__(self)
-        Composer.__init__(self)
-        SafeConstructor.__init__(self)
-        Resolver.__init__(self)
-
-
-class _Strict(_Loader):
-    """YAML 1.2's plain values: no dates, no sexagesimals, no octals, true and false alone as booleans; each key once;
-    no tags; an anchor holds no alias, so that a few lines cannot stand for millions."""
+class _Strict(_SAFE):
+    """Load YAML 1.2's plain values alone: no dates, sexagesimals or octals, two booleans, each key once."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - the loader's own way to say it
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> Any:
-        self._depth = getattr(self, "_depth", 0) + 1
-        self._nodes = getattr(self, "_nodes", 0) + 1
-        event: Any = self.peek_event()
-        is_alias = isinstance(event, yaml.AliasEvent)
-        self._aliases, self._within = getattr(self, "_aliases", 0) + is_alias, getattr(self, "_within", 0)
-        if self._aliases > MOST_ALIASES or (is_alias and self._within):
-            raise yaml.MarkedYAMLError(None, None, "too many aliases, or one inside an anchor", event.start_mark)
-        if self._depth > MOST_DEPTH or self._nodes > MOST_NODES:
-            raise yaml.MarkedYAMLError(None, None, "nested too deeply, or too large", event.start_mark)
-        if not is_alias and event.tag is not None:
-            written = str(event.tag).replace(_TAG, "!!")
-            raise yaml.MarkedYAMLError(None, None, f"remove the tag {written}: no value has one", event.start_mark)
-        anchored = not is_alias and event.anchor is not None
-        self._within += anchored
-        try:
-            return super().compose_node(parent, index)
-        finally:
-            self._depth, self._within = self._depth - 1, self._within - anchored
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set[str]()
@@ -115,6 +68,29 @@ def _float(loader: _Strict, node: yaml.ScalarNode) -> float:
 _Strict.add_constructor(f"{_TAG}float", _float)
 
 
+def _check_events(content: str) -> None:
+    """Raise MarkedYAMLError for a tag, and for depth, nodes or aliases by which few lines could stand for millions."""
+    nodes = aliases = 0
+    anchors = list[bool]()  # of the collections around an event, whether each has an anchor
+    for event in yaml.parse(content, Loader=_SAFE):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchors.pop()
+        if not isinstance(event, yaml.NodeEvent):
+            continue
+        nodes += 1
+        if isinstance(event, yaml.AliasEvent):
+            aliases += 1
+            if aliases > MOST_ALIASES or any(anchors):
+                raise yaml.MarkedYAMLError(None, None, "too many aliases, or one inside an anchor", event.start_mark)
+        elif (tag := getattr(event, "tag", None)) is not None:
+            tag = str(tag).replace(_TAG, "!!")
+            raise yaml.MarkedYAMLError(None, None, f"remove the tag {tag}: no value has one", event.start_mark)
+        if isinstance(event, yaml.CollectionStartEvent):
+            anchors.append(event.anchor is not None)
+        if len(anchors) >= MOST_DEPTH or nodes > MOST_NODES:
+            raise yaml.MarkedYAMLError(None, None, "nested too deeply, or too large", event.start_mark)
+
+
 def read_yaml(path: Path) -> Any:
     """Parsed YAML. Raises TrapsError naming file, line and the parser's complaint."""
     try:
@@ -124,7 +100,9 @@ def read_yaml(path: Path) -> Any:
     if len(content) > MOST_YAML_BYTES:
         raise TrapsError(f"{path}: not valid YAML (larger than {MOST_YAML_BYTES} bytes)")
     try:
-        value = yaml.load(content.decode("utf-8"), _Strict)  # noqa: S506 - a safe loader, made stricter
+        text = content.decode("utf-8")
+        _check_events(text)
+        value = yaml.load(text, _Strict)  # noqa: S506 - a safe loader, made stricter
         json.dumps(value, ensure_ascii=False).encode()  # halves of surrogate pairs
         return value
     except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
@@ -219,7 +197,7 @@ def parse_yaml_model(
     try:
         made = model.model_validate(data, context=context)
     except ValidationError as error:
-        raise TrapsError(f"{path}{where and ': ' + where}: {explain(error)}") from error
+        raise TrapsError(f"{path}{where and ': ' + where}: {explain(error, model)}") from error
     for field in _other_kinds(data, made):
         raise TrapsError(f"{path}{where and ': ' + where}: {field}")
     return made
@@ -244,7 +222,36 @@ def _other_kinds(data: Any, made: Any, name: str = "") -> Iterator[str]:
         yield from _other_kinds(raw, value, f"{name}.{key}" if name else str(key))
 
 
-def explain(error: ValidationError) -> str:
-    """A validation error in one line: field and complaint, `; ` between them."""
-    parts = ((".".join(map(str, e["loc"])), e["msg"].removeprefix("Value error, ")) for e in error.errors())
-    return plain("; ".join(f"{field}: {message}" if field else message for field, message in parts))[:MOST_SAID]
+def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+    """Return a validation error in one line: field and complaint, `; ` between them.
+
+    model: what was validated; an unknown field is then told with the known one that it resembles.
+    """
+    parts = list[str]()
+    for each in error.errors():
+        field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")
+        if each["type"] == "extra_forbidden":
+            known = [] if model is None else _fields_at(model, each["loc"][:-1])
+            similar = get_close_matches(str(each["loc"][-1]), known, 1)
+            message = "there is no such key" + (f"; did you mean {similar[0]}?" if similar else "")
+        parts.append(f"{field}: {message}" if field else message)
+    return plain("; ".join(parts))[:MOST_SAID]
+
+
+def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
+    """Return the names of the fields of a model, or of the model within it that lies at a place; [] if none does."""
+    for step in place:
+        field = model.model_fields.get(str(step))
+        if field is None:  # a number in a list, a name in a mapping or of a union's member
+            continue
+        inner = [each for each in _types_in(field.annotation) if isinstance(each, type) and issubclass(each, BaseModel)]
+        if len(inner) != 1:
+            return []
+        model = inner[0]
+    return [info.alias or name for name, info in model.model_fields.items()]
+
+
+def _types_in(annotation: Any) -> Iterator[Any]:
+    yield annotation
+    for each in get_args(annotation):
+        yield from _types_in(each)

@@ -13,11 +13,11 @@ from pydantic import RootModel, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import SCENE_SPECS
+from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
-from traps_pipeline.scenes.sample import answer_quota, ill_posed_quota, sample_family
-from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.scenes.workers import kept_workers
+from traps_pipeline.scenes.draw.sample import answer_quota, ill_posed_quota, sample_family
+from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
 

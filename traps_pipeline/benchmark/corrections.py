@@ -29,8 +29,8 @@ from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released
-from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
+from traps_pipeline.scenes.family_registry import family_names, get_family
+from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study
 
 WORDS = ("question", "labels", "aliases", "ill_posed_question", "answerable_question")
@@ -111,7 +111,9 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
             try:
                 found.append((where, Correction.model_validate(json.loads(line))))
             except ValidationError as error:
-                raise TrapsError(f"{where}: not a valid correction ({explain(error)}); correct that line") from error
+                raise TrapsError(
+                    f"{where}: not a valid correction ({explain(error, Correction)}); correct that line"
+                ) from error
             except ValueError as error:
                 raise TrapsError(f"{where}: not JSON ({error}); correct that line") from error
     return found

@@ -15,8 +15,8 @@ from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.tables import ARMS as ARMS_TABLE
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
-from traps_pipeline.scenes.clips import check_clip
-from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.picture.encode import DamagedClip
+from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage.workspace import Workspace
 
 Record = Mapping[str, Any]

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.scenes.clips import Clip, check_clip, note_of, read_note
-from traps_pipeline.scenes.encode import DamagedClip
-from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.base.workers import run_in_order
+from traps_pipeline.scenes.picture.encode import DamagedClip
+from traps_pipeline.scenes.worlds.clips import Clip, check_clip, note_of, read_note
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 

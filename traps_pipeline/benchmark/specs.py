@@ -19,9 +19,9 @@ from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, f
 from traps_pipeline.benchmark.records import load_released, parse_record
 from traps_pipeline.benchmark.tables import SceneSpecRow
 from traps_pipeline.benchmark.versions import spec_content, version_of
-from traps_pipeline.scenes.kit import Physics, Wording
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Physics, Wording
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
 from traps_pipeline.storage.workspace import Workspace
 
 SECONDS_A_RECORD = 0.04  # of one core, measured: its trajectories are read, and its evidence is measured again
@@ -111,9 +111,9 @@ def _words_still_fit(scenario: Scenario) -> bool:
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
     """Resolve a scene whose parameters a correction gave. Raises TrapsError naming the correction."""
-    from traps_pipeline.scenes.outcome import Rejected
-    from traps_pipeline.scenes.resolve import resolve
-    from traps_pipeline.scenes.wording import draw_ill_posed
+    from traps_pipeline.scenes.draw.resolve import resolve
+    from traps_pipeline.scenes.parts.wording import draw_ill_posed
+    from traps_pipeline.scenes.worlds.outcome import Rejected
 
     family = get_family(scenario.family)
     try:
@@ -244,7 +244,7 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
 
 def unsettled(resolved: Sequence[Resolved]) -> list[str]:
     """Problems with outcomes: the certificate `outcome`, measured again from each frozen trajectory."""
-    from traps_pipeline.scenes.certificates import OUTCOME, pair_of
+    from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 
     problems = []
     for item in resolved:

@@ -13,7 +13,7 @@ from typing import Any
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.partitions import is_ill_posed
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:

@@ -14,9 +14,9 @@ from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
-from traps_pipeline.scenes.clips import Clip, Job, note_of, read_clip, render_pair
-from traps_pipeline.scenes.encode import DamagedClip
-from traps_pipeline.scenes.look import frame_size
+from traps_pipeline.scenes.parts.look import frame_size
+from traps_pipeline.scenes.picture.encode import DamagedClip
+from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, render_pair
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = ("control", "void", "twin")

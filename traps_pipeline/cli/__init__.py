@@ -28,7 +28,6 @@ from traps_pipeline.cli import (
     ledger,
     models,
     plan,
-    pocket,
     release,
     results,
     review,
@@ -43,16 +42,16 @@ from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
     """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
-    interrupted."""
+    interrupted. parser: that of another program which ends as this one does."""
     gc.set_threshold(50_000, 20, 20)  # imported objects stay: searching them for garbage costs half a second
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
     redact_tracebacks()
     try:
-        return _run(argv)
+        return _run(argv, parser or build_parser())
     except BrokenPipeError:
         # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
         for stream in (sys.stdout, sys.stderr):
@@ -60,10 +59,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def _run(argv: Sequence[str] | None) -> int:
+def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
     """Run a subcommand. Raises BrokenPipeError where what it prints, or the end of it, is not read."""
     try:
-        arguments = build_parser().parse_args(argv)
+        arguments = parser.parse_args(argv)
         command: Run = arguments.command
         with _stopped_alike():
             return command(arguments)
@@ -142,7 +141,6 @@ def build_parser() -> argparse.ArgumentParser:
         judges,
         confabulation,
         benchmark,
-        pocket,
     ):
         noun.add(commands)
     return parser

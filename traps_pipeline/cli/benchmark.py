@@ -18,7 +18,7 @@ LOOKS = (
     "camera",
     "material",
     "size",
-)  # `scenes.look.PARTS`, which takes long to import
+)  # `scenes.parts.look.PARTS`, which takes long to import
 
 
 def add(commands: Commands) -> None:
@@ -60,7 +60,7 @@ def add(commands: Commands) -> None:
 def certify(arguments: argparse.Namespace) -> int:
     """See `traps certify --help`."""
     from traps_pipeline.base.paths import SCENE_SPECS, WORKSPACES
-    from traps_pipeline.benchmark.certificates import certify_all, family_table
+    from traps_pipeline.benchmark.certify_all import certify_all, family_table
 
     folder = (arguments.specs or SCENE_SPECS).absolute()
     kept = WORKSPACES / "certificates"
@@ -85,7 +85,7 @@ def sample(arguments: argparse.Namespace) -> int:
     from traps_pipeline.base.names import check_name
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
-    from traps_pipeline.scenes.registry import family_names
+    from traps_pipeline.scenes.family_registry import family_names
 
     counts = load_composition()
     names = arguments.families or list(counts)

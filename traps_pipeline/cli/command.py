@@ -126,8 +126,8 @@ def entered(workspace: Workspace) -> Workspace:
 
 
 def load_definitions() -> None:
-    """Declare the graph, from which staleness is computed."""
-    import traps_pipeline.definitions  # noqa: F401 - its import is what declares the graph
+    """Declare the graph, from which staleness is computed, without Dagster."""
+    import traps_pipeline.defs  # noqa: F401 - its import is what declares the graph
 
 
 def add_panel(parser: argparse.ArgumentParser) -> None:

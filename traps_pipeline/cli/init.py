@@ -52,9 +52,9 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
         workspace = workspace.allow(experiments=asked)
     entered(workspace)
     keep(workspace)
-    from traps_pipeline.orchestration.run import dagster_history
-
     if not (workspace.dagster_home / "dagster.yaml").exists():
+        from traps_pipeline.orchestration.run import dagster_history
+
         with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
             pass
     return workspace

@@ -12,7 +12,7 @@ from traps_pipeline.cli.submission import verify_file
 
 if TYPE_CHECKING:
     from traps_pipeline.release.commitment import Commitment
-    from traps_pipeline.scenes.spec import SceneSpec
+    from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def add(commands: Commands) -> None:

@@ -5,24 +5,33 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of, number, whole
+from traps_pipeline.cli.command import (
+    FAILED,
+    OK,
+    OVER_BUDGET,
+    Commands,
+    add_panel,
+    experiment_of,
+    load_definitions,
+    number,
+    whole,
+)
 from traps_pipeline.cli.init import create
 
 if TYPE_CHECKING:
     from dagster import DagsterInstance
 
-    from traps_pipeline.models.registry import Entry
     from traps_pipeline.orchestration.runs import Runs
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import Experiment
+    from traps_pipeline.study.experiment_run import RunReport
 
 MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of an experiment and of a study
 
@@ -77,61 +86,55 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
-    from traps_pipeline.base.progress import Tally, clock, reporting
+    from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import TerminalProgress
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
-    import traps_pipeline.definitions  # noqa: F401 - declares the graph
-    from traps_pipeline.models.backends import require_libraries
-    from traps_pipeline.orchestration.machine import require_machine, wanted_parts
-    from traps_pipeline.orchestration.run import dagster_history, failed_checks, require_work, stages_until, walk
+    load_definitions()
+    from traps_pipeline.study.experiment_run import run_experiment
 
-    stages = stages_until(arguments.until)
-    require_work(workspace, experiment.name, arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
-    with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
-        participants = _still_to_ask(workspace, experiment, stages)
-        for entry in (*participants.models, *participants.judges):
-            require_libraries(entry)
-        if experiment.mechanism is not None and "hidden_states" in stages:
-            require("local")
-        if not arguments.cluster:  # there the hosts that make runs look at themselves
-            require_machine(workspace, wanted_parts(workspace, stages, experiment.name))
-        if not arguments.no_preflight:
-            _preflight(workspace, participants)
-        with _runs(arguments, instance, workspace) as runs:
-            outcome = walk(instance, runs, workspace, stages, experiment=experiment.name)
-    problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
-    total = progress.totals
-    asked, voted = (total.get(stage, Tally()) for stage in ("responses", "votes"))
-    frames = sum(tally.frames for tally in total.values())
-    print(
-        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
-        f"({voted.cached} from the ledger), {frames} frames rendered, {clock(outcome.seconds)} min"
-    )
-    if experiment.canary and not problems:
+    with reporting(TerminalProgress()):
+        report = run_experiment(
+            workspace,
+            experiment,
+            until=arguments.until,
+            preflight=None if arguments.no_preflight else partial(print, flush=True),
+            look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
+            open_runs=partial(_open_runs, arguments),
+        )
+    _print_work(report, is_inside=experiment.mechanism is not None)
+    if experiment.canary and not report.problems:
         from traps_pipeline.study.canary import ask_canary, changes_text
 
         with reporting(TerminalProgress()):
             print(changes_text(ask_canary(workspace, experiment.models)))
-    if experiment.mechanism is not None:
-        states, steered, judged = (
-            total.get(stage, Tally()) for stage in ("hidden_states", "steering", "steering_votes")
-        )
-        print(
-            f"inside models: {states.asked} items extracted, {steered.asked} steered answers asked "
-            f"({steered.cached} from the ledger), {judged.asked} votes on them"
-        )
-    if problems:
-        _print_problems(problems)
-        return OVER_BUDGET if outcome.over_budget else FAILED
+    if report.problems:
+        _print_problems(report.problems)
+        return OVER_BUDGET if report.over_budget else FAILED
     if arguments.until is not None:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK
     _print_results(workspace)
     print(f"next: open {workspace.reports / 'report.html'}, or run traps why ITEM to examine an item's answers")
     return OK
+
+
+def _print_work(report: RunReport, *, is_inside: bool) -> None:
+    from traps_pipeline.base.progress import clock
+
+    asked, voted = report.tally("responses"), report.tally("votes")
+    print(
+        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
+        f"({voted.cached} from the ledger), {report.frames} frames rendered, {clock(report.seconds)} min"
+    )
+    if is_inside:
+        states, steered, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
+        print(
+            f"inside models: {states.asked} items extracted, {steered.asked} steered answers asked "
+            f"({steered.cached} from the ledger), {judged.asked} votes on them"
+        )
 
 
 def _print_problems(problems: Sequence[str]) -> None:
@@ -150,7 +153,7 @@ def _print_problems(problems: Sequence[str]) -> None:
 
 
 @contextmanager
-def _runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
+def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
     """Who makes the runs: this process, or the hosts of a cluster. Raises TrapsError where there is none."""
     from traps_pipeline.definitions import defs
     from traps_pipeline.orchestration.runs import RunsHere
@@ -164,52 +167,6 @@ def _runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: W
     given = arguments.runs, arguments.gpus, arguments.on_interrupt, arguments.cpus
     with RayRuns(instance, workspace, *given) as runs:
         yield runs
-
-
-@dataclass(frozen=True)
-class _Participants:
-    """Models and judges that still have something to answer, and whose libraries or keys may be missing here."""
-
-    models: list[Entry]
-    judges: list[Entry]
-
-
-def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
-    """Who is asked over the network or on this machine, as far as the ledger does not hold all of their answers."""
-    from traps_pipeline.base.partitions import Cell
-    from traps_pipeline.models.judges import load_panel
-    from traps_pipeline.models.registry import LOCAL, NETWORK, get_model
-    from traps_pipeline.orchestration.lineage import Lineage
-    from traps_pipeline.orchestration.wanted import Wanted
-
-    lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
-
-    def behind(stage: str) -> Iterator[str]:
-        wanted = cells if stage in stages else ()
-        return (key for key in wanted if lineage.status(stage, key).kind != "fresh")
-
-    asked = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
-    panel = load_panel(workspace.study.panel) if "votes" in stages else ()
-    judges: list[Entry] = [judge for judge in panel if judge.backend == NETWORK]
-    # Whether a cell is behind is looked up for the sake of these alone.
-    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if asked else set[str]()
-    models: list[Entry] = [entry for name, entry in asked.items() if name in names]
-    return _Participants(models, judges if judges and any(behind("votes")) else [])
-
-
-def _preflight(workspace: Workspace, participants: _Participants) -> None:
-    """Try the models and judges over the network, before a clip is rendered. Raises TrapsError naming all that is
-    wrong."""
-    from traps_pipeline.models.registry import NETWORK
-    from traps_pipeline.study.live_check import preflight, require_sound
-
-    models = [entry for entry in participants.models if entry.backend == NETWORK]
-    if not models and not participants.judges:
-        return
-    found = preflight(workspace, models, participants.judges)
-    for one in found:
-        print(one.line, flush=True)
-    require_sound(found)
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:

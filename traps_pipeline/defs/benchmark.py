@@ -4,8 +4,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-import dagster as dg
-
 from traps_pipeline.base.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.benchmark.composition import problems
@@ -14,7 +12,7 @@ from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check, Shared, Takes
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
-from traps_pipeline.orchestration.stage import key_of, shown, source, stage
+from traps_pipeline.orchestration.stage import is_declared, of, source, stage
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -49,7 +47,7 @@ def _make_specs(workspace: Workspace, category: str) -> Made:
 
 def _evidence(find: str) -> Callable[[Workspace, str | None, Made], Any]:
     def wrong(workspace: Workspace, key: str | None, made: Made) -> Any:
-        from traps_pipeline.benchmark import evidence
+        from traps_pipeline.benchmark import stored_evidence as evidence
 
         return getattr(evidence, find)([item.spec for item in made.beside])
 
@@ -60,7 +58,7 @@ scene_specs = stage(
     SCENE_SPECS,
     _make_specs,
     group=GROUP,
-    deps=[released_specs, corrections],
+    parents=[released_specs, corrections],
     scheme=CATEGORY,
     code="3",
     kinds=["parquet", "mujoco"],
@@ -135,14 +133,13 @@ videos = stage(
     VIDEOS,
     _make_videos,
     group=GROUP,
-    deps=[scene_specs],
+    parents=[scene_specs],
     scheme=CATEGORY,
     code="2",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=Shared(_render, _to_render_s),
     lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in missing_clips(workspace, str(key))],
-    columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},
     checks=[
         Check(
             "panel_hides",
@@ -156,7 +153,7 @@ videos = stage(
 
 def _make_arms(workspace: Workspace, category: str) -> Made:
     """The arms and variations of a category's scenarios that the study asks: clips and questions beside the pairs."""
-    from traps_pipeline.benchmark.arms import build_arms
+    from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
@@ -164,20 +161,20 @@ def _make_arms(workspace: Workspace, category: str) -> Made:
 
 
 def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
-    from traps_pipeline.benchmark.arms import film_arms
+    from traps_pipeline.benchmark.filmed_arms import film_arms
 
     frames, is_whole = film_arms(workspace, category, wait=wait)
     return Tally(frames=frames), is_whole
 
 
 def _to_film_s(workspace: Workspace, category: str) -> float:
-    from traps_pipeline.benchmark.arms import seconds_left
+    from traps_pipeline.benchmark.filmed_arms import seconds_left
 
     return seconds_left(workspace, category)
 
 
 def _unmade_arms(workspace: Workspace, category: str) -> list[str]:
-    from traps_pipeline.benchmark.arms import unmade
+    from traps_pipeline.benchmark.filmed_arms import unmade
 
     return unmade(workspace, category)
 
@@ -186,7 +183,7 @@ arms = stage(
     ARMS,
     _make_arms,
     group="arms",
-    deps=[scene_specs, videos],
+    parents=[scene_specs, videos],
     scheme=CATEGORY,
     code="3",
     kinds=["parquet", "mp4"],
@@ -194,7 +191,6 @@ arms = stage(
     shared=Shared(_film, _to_film_s),
     wants=lambda wanted, key: bool({*wanted.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
     lost=lambda workspace, key: _unmade_arms(workspace, str(key)),
-    columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},
 )
 
 
@@ -217,16 +213,12 @@ items = stage(
     ITEMS,
     _make_items,
     group=GROUP,
-    deps=[
-        *(dg.AssetDep(above, partition_mapping=category_to_datasets) for above in (scene_specs, videos)),
-        *([dg.AssetDep(key_of("arms"), partition_mapping=category_to_arms)] if shown("arms") else []),
+    parents=[
+        of(scene_specs, category_to_datasets),
+        of(videos, category_to_datasets),
+        *([of(arms, category_to_arms)] if is_declared("arms") else []),
     ],
     scheme=DATASET,
-    columns={
-        **{n: [f"scene_specs.{n}"] for n in ("scenario_id", "category", "sub_scenario", "labels", "answer_type")},
-        "question": ["scene_specs.question", "scene_specs.ill_posed_question"],
-        "clip": ["videos.path"],
-    },
     checks=[
         Check(
             "two_items_a_pair",

@@ -1,9 +1,7 @@
 """The evaluation group: answers of models, votes of judges, verdicts of the panel. A cell is dataset x evaluation."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
-
-import dagster as dg
 
 from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
@@ -17,9 +15,10 @@ from traps_pipeline.models.reading import READING
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES, ResponseRow
-from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.graph import Check, Collect
+from traps_pipeline.orchestration.previews import Records, StudyFile
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
-from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -51,21 +50,23 @@ judges = source(
     doc="assets/judges.yaml and the judges' prompts: the study's panel.",
     kinds=["yaml"],
 )
-_ITEM_COLUMNS = {name: [f"items.{name}"] for name in ("item_id", "pair_id", "side", "benchmark_version")}
 
 
-def _cells(
-    collect: Callable[[Workspace, Sequence[Cell]], Iterator[tuple[Cell, Made]]],
-) -> Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]]:
-    """A stage's `collect` by partition keys, from a function of cells; it adds a cell's items to the metadata."""
+def _collect_answers(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+    """Answers of a model under a regime in a run, one row per item; answers in the ledger are not asked again."""
+    return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
-    def collected(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
-        for cell, made in collect(workspace, [Cell.parse(key) for key in keys]):
-            shown = {**made.shown, **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], made.content))}
-            yield cell.key, Made(made.content, made.tally, shown)
 
-    collected.__doc__ = collect.__doc__
-    return collected
+def _collect_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+    """Votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
+    return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
+
+
+def _with_items(workspace: Workspace, cells: Iterator[tuple[Cell, Made]]) -> Iterator[tuple[str | None, Made]]:
+    """Add a cell's items to what is shown of it."""
+    for cell, made in cells:
+        shown = {**made.shown, **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], made.content))}
+        yield cell.key, Made(made.content, made.tally, shown)
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
@@ -75,11 +76,10 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     page = workspace.reports / FOLDER / page_name(cell)
     columns = ("item_id", "side", "outcome", "error", "attempts")
     without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
-    records = [dg.TableRecord({name: str(getattr(row, name)) for name in columns}) for row in without[:ITEMS_SHOWN]]
-    table = {"without an answer": dg.MetadataValue.table(records)} if records else {}
+    records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
+    table = {"without an answer": Records(records)} if records else {}
     why = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
-    links = {"items": dg.MetadataValue.asset(items.key), "all items": dg.MetadataValue.path(str(page))}
-    return {**table, **links, **why}
+    return {**table, "all items": StudyFile(workspace.relative(page)), **why}
 
 
 def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
@@ -91,18 +91,16 @@ def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
 
 responses = stage(
     RESPONSES,
-    collect=_cells(collect_answers),
-    doc="Answers of a model under a regime in a run, one row per item; answers in the ledger are not asked again.",
+    Collect(_collect_answers),
     group=GROUP,
-    deps=[
-        dg.AssetDep(items, partition_mapping=by_dataset),
-        dg.AssetDep(models, partition_mapping=by_evaluation),
-        dg.AssetDep(prompts, partition_mapping=by_evaluation),
+    parents=[
+        of(items, by_dataset),
+        of(models, by_evaluation),
+        of(prompts, by_evaluation),
     ],
     scheme=CELL,
     code=f"3.{READING}",
     cost="money",
-    columns=_ITEM_COLUMNS,
     checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
 )
 
@@ -116,14 +114,12 @@ def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
 
 votes = stage(
     VOTES,
-    collect=_cells(collect_votes),
-    doc="Votes of the study's panel on the answers of a cell, one row per answer, judge and task.",
+    Collect(_collect_votes),
     group=GROUP,
-    deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, judges],
+    parents=[of(items, by_dataset), responses, judges],
     scheme=CELL,
     code="3",
     cost="money",
-    columns={name: [f"responses.{name}"] for name in ("item_id", "side", "benchmark_version")},
     checks=[
         Check(
             "few_invalid_votes",
@@ -153,15 +149,8 @@ verdicts = stage(
     VERDICTS,
     _make_verdicts,
     group=GROUP,
-    deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, votes, judges],
+    parents=[of(items, by_dataset), responses, votes, judges],
     scheme=CELL,
     code="3",
-    columns={
-        "item_id": ["responses.item_id"],
-        "outcome": ["responses.outcome", "votes.invalid_reason"],
-        "abstained": ["votes.abstained", "votes.valid"],
-        "correct": ["votes.correct", "votes.valid"],
-        "control_answer": ["items.control_answer"],
-    },
     checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
 )

@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-import dagster as dg
-
 from traps_pipeline.base.partitions import DATASETS, PROBE_PROMPT, PROBED_ARMS, Cell, Evaluation, Extraction
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.mechanism import (
@@ -28,9 +26,9 @@ from traps_pipeline.mechanism.control_tables import (
 from traps_pipeline.mechanism.tables import STEERING_EFFECTS
 from traps_pipeline.mechanism.versions import patching_version
 from traps_pipeline.models.registry import ModelEntry, local_models
-from traps_pipeline.orchestration.graph import Need
+from traps_pipeline.orchestration.partitioning import EVERY, SAME
 from traps_pipeline.orchestration.schemes import CELL, EXTRACTION, by_extraction, these_keys
-from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -69,14 +67,13 @@ probe_baselines = stage(
     _make_baselines,
     group=GROUP,
     code="2",
-    deps=[
-        dg.AssetDep(hidden_states, partition_mapping=by_extraction),
-        dg.AssetDep(probe_items, partition_mapping=dg.AllPartitionMapping()),
-        dg.AssetDep(verdicts, partition_mapping=ANSWERED),
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(probe_items, EVERY),
+        of(verdicts, ANSWERED, need="none"),
         probing_settings,
     ],
     scheme=EXTRACTION,
-    needs={"hidden_states": "some", "verdicts": "none"},
     kinds=["parquet", "scikitlearn"],
     cost="machine",  # the output margin needs the model's head
     wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
@@ -109,20 +106,18 @@ _REGIMES = ("standard", "guided")
 _ASKED = (*DATASETS, *PROBED_ARMS)
 _GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in _REGIMES])
 _OF_GATE = [
-    dg.AssetDep(hidden_states, partition_mapping=by_extraction),
-    dg.AssetDep(probe_items, partition_mapping=dg.AllPartitionMapping()),
-    dg.AssetDep(probes, partition_mapping=dg.IdentityPartitionMapping()),
-    dg.AssetDep(verdicts, partition_mapping=_GATED),
+    of(hidden_states, by_extraction, need="some"),
+    of(probe_items, EVERY),
+    of(probes, SAME),
+    of(verdicts, _GATED, need="some"),
     probing_settings,
 ]
-_SOME_STATES: dict[str, Need] = {"hidden_states": "some", "verdicts": "some"}
 gate = stage(
     GATE,
     _make_gate,
     group=GROUP,
-    deps=_OF_GATE,
+    parents=_OF_GATE,
     scheme=EXTRACTION,
-    needs=_SOME_STATES,
     wants=_gated,
     cost="machine",
 )
@@ -130,9 +125,8 @@ risk_coverage = stage(
     RISK_COVERAGE,
     _make_curves,
     group=GROUP,
-    deps=_OF_GATE,
+    parents=_OF_GATE,
     scheme=EXTRACTION,
-    needs=_SOME_STATES,
     wants=_gated,
     cost="machine",
 )
@@ -151,9 +145,8 @@ patching = stage(
     PATCHING,
     _make_patching,
     group=GROUP,
-    deps=[dg.AssetDep(probe_items, partition_mapping=dg.AllPartitionMapping()), patching_settings],
+    parents=[of(probe_items, EVERY, need="some"), patching_settings],
     scheme=EXTRACTION,
-    needs={"probe_items": "some"},
     wants=lambda wanted, key: wanted.patches and Extraction.parse(key).prompt == PROBE_PROMPT,
     kinds=["parquet", "pytorch"],
     cost="machine",
@@ -180,5 +173,5 @@ def _make_steering_pecs(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"pecs": rows_shown(table)})
 
 
-steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, deps=[steering_effects], wants=steers)
-steering_pecs = stage(STEERING_PECS, _make_steering_pecs, group=GROUP, deps=[steering_effects], wants=steers)
+steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, parents=[steering_effects], wants=steers)
+steering_pecs = stage(STEERING_PECS, _make_steering_pecs, group=GROUP, parents=[steering_effects], wants=steers)

@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-import dagster as dg
-
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import MAX_INVALID_SHARE, judges, responses, verdicts, votes
@@ -11,9 +9,9 @@ from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
 from traps_pipeline.judging.tables import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
-from traps_pipeline.orchestration.graph import Check, Need
+from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CELL, these_keys
-from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -114,23 +112,22 @@ def _make_prevalence(workspace: Workspace, _: None) -> Made:
     return _shown("prevalence", prevalence(workspace.tables.read(CONFABULATION, {})))
 
 
-_SOME: dict[str, Need] = {"items": "some", "votes": "some", "verdicts": "some"}
-agreement = stage(AGREEMENT, _make_agreement, group=GROUP, deps=[items, votes, judges], needs=_SOME)
-judge_bias = stage(JUDGE_BIAS, _make_judge_bias, group=GROUP, deps=[items, votes, judges], needs=_SOME)
+_VOTED = (of(items, need="some"), of(votes, need="some"), judges)
+agreement = stage(AGREEMENT, _make_agreement, group=GROUP, parents=_VOTED)
+judge_bias = stage(JUDGE_BIAS, _make_judge_bias, group=GROUP, parents=_VOTED)
 leave_one_out = stage(
-    LEAVE_ONE_OUT, _make_leave_one_out, group=GROUP, deps=[items, votes, verdicts, leaderboard, judges], needs=_SOME
+    LEAVE_ONE_OUT, _make_leave_one_out, group=GROUP, parents=[*_VOTED, of(verdicts, need="some"), leaderboard]
 )
 confabulation = stage(
     CONFABULATION,
     _make_confabulation,
     group=GROUP,
-    deps=[
-        items,
-        dg.AssetDep(responses, partition_mapping=_SAMPLED),
-        dg.AssetDep(verdicts, partition_mapping=_SAMPLED),
+    parents=[
+        of(items, need="none"),
+        of(responses, _SAMPLED, need="none"),
+        of(verdicts, _SAMPLED, need="none"),
         confabulation_protocol,
     ],
-    needs={"items": "none", "responses": "none", "verdicts": "none"},
     code="2",
     cost="money",
     checks=[
@@ -142,4 +139,4 @@ confabulation = stage(
         )
     ],
 )
-confabulation_prevalence = stage(CONFABULATION_PREVALENCE, _make_prevalence, group=GROUP, deps=[confabulation])
+confabulation_prevalence = stage(CONFABULATION_PREVALENCE, _make_prevalence, group=GROUP, parents=[confabulation])

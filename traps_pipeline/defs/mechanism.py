@@ -3,8 +3,6 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-import dagster as dg
-
 from traps_pipeline.base.partitions import (
     ANSWERABLE,
     DATASETS,
@@ -40,7 +38,8 @@ from traps_pipeline.mechanism.versions import (
     steering_version,
 )
 from traps_pipeline.models.registry import local_models
-from traps_pipeline.orchestration.graph import Check, Need, Takes
+from traps_pipeline.orchestration.graph import Check, Collect, Takes
+from traps_pipeline.orchestration.partitioning import EVERY
 from traps_pipeline.orchestration.schemes import (
     CATEGORY,
     CELL,
@@ -56,7 +55,7 @@ from traps_pipeline.orchestration.schemes import (
     these_keys,
     to_keys,
 )
-from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -116,10 +115,10 @@ probe_items = stage(
     _make_probe_items,
     group=GROUP,
     code="2",
-    deps=[
-        dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, _probed_from)),
-        dg.AssetDep(scene_specs, partition_mapping=_OCCLUSION),
-        dg.AssetDep(videos, partition_mapping=_OCCLUSION),
+    parents=[
+        of(items, to_keys(DATASET, PROBED, _probed_from)),
+        of(scene_specs, _OCCLUSION),
+        of(videos, _OCCLUSION),
     ],
     scheme=PROBED,
 )
@@ -143,9 +142,9 @@ hidden_states = stage(
     HIDDEN_STATES,
     _make_hidden_states,
     group=GROUP,
-    deps=[
-        dg.AssetDep(probe_items, partition_mapping=by_dataset),
-        dg.AssetDep(extraction_settings, partition_mapping=by_extraction),
+    parents=[
+        of(probe_items, by_dataset),
+        of(extraction_settings, by_extraction),
     ],
     scheme=STATES,
     kinds=["parquet", "pytorch"],
@@ -176,14 +175,13 @@ probes = stage(
     _make_probes,
     group=GROUP,
     code="2",
-    deps=[
-        dg.AssetDep(hidden_states, partition_mapping=by_extraction),
-        dg.AssetDep(verdicts, partition_mapping=ANSWERED),
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(verdicts, ANSWERED, need="none"),
         probing_settings,
     ],
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
-    needs={"hidden_states": "some", "verdicts": "none"},
     takes=Takes(memory_gb=1.0, each_gb=0.5),
     wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
@@ -202,9 +200,8 @@ directions = stage(
     _make_directions,
     group=GROUP,
     code="2",
-    deps=[dg.AssetDep(hidden_states, partition_mapping=by_extraction), probing_settings],
+    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
     scheme=EXTRACTION,
-    needs={"hidden_states": "some"},
     wants=steers,
     lost=lambda workspace, key: (
         [] if directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
@@ -222,7 +219,7 @@ def _make_cosines(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"cosines": rows_shown(table)})
 
 
-cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=steers)
+cosines = stage(COSINES, _make_cosines, group=GROUP, parents=[of(directions, need="some")], wants=steers)
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
@@ -240,16 +237,15 @@ def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tup
 
 steering = stage(
     STEERING_TABLE,
-    collect=_collect_steering,
+    Collect(_collect_steering),
     group=GROUP,
     code="3",
-    deps=[
-        dg.AssetDep(items, partition_mapping=by_dataset),
-        dg.AssetDep(directions, partition_mapping=dg.AllPartitionMapping()),
-        dg.AssetDep(steering_settings, partition_mapping=by_steering),
+    parents=[
+        of(items, by_dataset),
+        of(directions, EVERY, need="some"),
+        of(steering_settings, by_steering),
     ],
     scheme=STEERING,
-    needs={"directions": "some"},
     kinds=["parquet", "pytorch"],
     cost="machine",
 )
@@ -265,10 +261,10 @@ def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterat
 
 steering_votes = stage(
     STEERING_VOTES,
-    collect=_collect_steering_votes,
+    Collect(_collect_steering_votes),
     group=GROUP,
     code="3",
-    deps=[dg.AssetDep(items, partition_mapping=by_dataset), steering, judges],
+    parents=[of(items, by_dataset), steering, judges],
     scheme=STEERING,
     cost="money",
 )
@@ -301,9 +297,8 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"shares": rows_shown(table)})
 
 
-_SOME: dict[str, Need] = {"steering": "some", "steering_votes": "some"}
-_ABOVE = [steering, steering_votes]
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", deps=_ABOVE, needs=_SOME, wants=steers)
+_ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", parents=_ABOVE, wants=steers)
 
 
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="3", deps=_ABOVE, needs=_SOME, wants=steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="3", parents=_ABOVE, wants=steers)

@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-import dagster as dg
-
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, responses, verdicts
@@ -11,8 +9,7 @@ from traps_pipeline.defs.judging import confabulation
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
 from traps_pipeline.judging.tables import VERDICTS
-from traps_pipeline.orchestration.graph import Need
-from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -96,18 +93,15 @@ def _make_corrected(workspace: Workspace, _: None) -> Made:
     return _shown("judged and corrected", corrected(*_labels_and_verdicts(workspace)))
 
 
-_NONE: dict[str, Need] = {"items": "none", "responses": "none", "verdicts": "none", "confabulation": "none"}
-_SOME: dict[str, Need] = {"verdicts": "none"}
+_LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, confabulation))
 human_labels = stage(
     HUMAN_LABELS,
     _make_labels,
     group=GROUP,
-    deps=[items, dg.AssetDep(responses), dg.AssetDep(verdicts), confabulation, people, annotation_protocol, judges],
-    needs=_NONE,
+    parents=[*_LABELLED, people, annotation_protocol, judges],
 )
-human_agreement = stage(HUMAN_AGREEMENT, _make_agreement, group=GROUP, deps=[human_labels])
-human_row = stage(HUMAN_ROW, _make_row, group=GROUP, code="2", deps=[human_labels])
-panel_errors = stage(
-    PANEL_ERRORS, _make_errors, group=GROUP, code="2", deps=[human_labels, verdicts, judges], needs=_SOME
-)
-corrected = stage(CORRECTED, _make_corrected, group=GROUP, code="2", deps=[human_labels, verdicts, judges], needs=_SOME)
+_AGAINST = (human_labels, of(verdicts, need="none"), judges)
+human_agreement = stage(HUMAN_AGREEMENT, _make_agreement, group=GROUP, parents=[human_labels])
+human_row = stage(HUMAN_ROW, _make_row, group=GROUP, code="2", parents=[human_labels])
+panel_errors = stage(PANEL_ERRORS, _make_errors, group=GROUP, code="2", parents=_AGAINST)
+corrected = stage(CORRECTED, _make_corrected, group=GROUP, code="2", parents=_AGAINST)

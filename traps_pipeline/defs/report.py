@@ -3,16 +3,15 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import dagster as dg
-
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
-from traps_pipeline.orchestration.graph import Need
+from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.pieces import Files, Piece, make_pieces
-from traps_pipeline.orchestration.stage import code_of, key_of, shown, source, stage
+from traps_pipeline.orchestration.previews import Markdown
+from traps_pipeline.orchestration.stage import code_of, is_declared, of, source, stage
 from traps_pipeline.report.catalogue import FIGURES, TABLES, Report, workspace_files
 from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest
@@ -37,7 +36,7 @@ def _report(
     *,
     deps: Sequence[str],
     kinds: Sequence[str] = ("png",),
-) -> dg.AssetsDefinition:
+) -> Stage:
     """An asset that writes files for people into the workspace's `reports` folder, from those tables that exist."""
 
     def made(workspace: Workspace, _: None) -> Made:
@@ -49,17 +48,16 @@ def _report(
 
 def _stage(
     name: str, made: Callable[[Workspace, Any], Made], doc: str, deps: Sequence[str], kinds: Sequence[str]
-) -> dg.AssetsDefinition:
-    existing = [dep for dep in deps if shown(dep)]
-    needs: dict[str, Need] = dict.fromkeys(existing, "none")
-    above = [key_of(dep) for dep in existing]
-    return stage(name, made, doc=doc, group=GROUP, deps=above, needs=needs, kinds=kinds)
+) -> Stage:
+    parents = [of(dep, need="none") for dep in deps if is_declared(dep)]
+    made.__doc__ = doc
+    return stage(name, made, group=GROUP, parents=parents, kinds=kinds)
 
 
 def _previews(files: Mapping[str, bytes], names: Sequence[str]) -> dict[str, Any]:
     """Previews for Dagster of some files: small pictures, and tables as Markdown."""
     pictures = {f"preview of {f}": thumbnail(files[f]) for f in names if f.endswith(".png")}
-    texts = {f"preview of {f}": dg.MetadataValue.md(files[f].decode()) for f in names if f.endswith(".md")}
+    texts = {f"preview of {f}": Markdown(files[f].decode()) for f in names if f.endswith(".md")}
     return pictures | texts
 
 
@@ -93,7 +91,7 @@ def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.benchmark.shortcuts import shortcuts
     from traps_pipeline.report.figures.shortcuts import shortcut_figure
     from traps_pipeline.report.writing import figure_bytes
-    from traps_pipeline.scenes.encode import DamagedClip
+    from traps_pipeline.scenes.picture.encode import DamagedClip
 
     rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
     if rows.empty:
@@ -200,7 +198,7 @@ def _kept(slot: tuple[str, Any], make: Callable[[], Results]) -> Results:
 _KEPT: dict[str, tuple[Any, Results]] = {}
 
 
-def _printed(name: str, reports: Sequence[Report], doc: str, previewed: Sequence[str]) -> dg.AssetsDefinition:
+def _printed(name: str, reports: Sequence[Report], doc: str, previewed: Sequence[str]) -> Stage:
     """An asset of many tables or figures of the study, each made again only when a table that it reads changed."""
 
     def made(workspace: Workspace, _: None) -> Made:
@@ -216,7 +214,7 @@ def _printed(name: str, reports: Sequence[Report], doc: str, previewed: Sequence
     return _stage(name, made, doc, [*reads], ["csv" if name == "report_tables" else "png"])
 
 
-def _printed_of_paper(name: str, reports: Sequence[Report], doc: str) -> dg.AssetsDefinition:
+def _printed_of_paper(name: str, reports: Sequence[Report], doc: str) -> Stage:
     def files(workspace: Workspace) -> Files:
         results = _results(workspace, of_paper=True)
         return {path: data for report in reports for path, data in workspace_files(report, results).items()}

@@ -2,17 +2,16 @@
 
 from typing import TYPE_CHECKING
 
-import dagster as dg
-
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import ARMS, DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.judging.tables import VERDICTS
-from traps_pipeline.orchestration.graph import Check, Need
+from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.previews import Markdown
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
-from traps_pipeline.orchestration.stage import stage
+from traps_pipeline.orchestration.stage import of, stage
 from traps_pipeline.scoring.tables import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 GROUP = "scoring"
-_SHARES = {name: ["verdicts.abstained", "verdicts.correct"] for name in ("pecs", "naive")}
 
 
 def _make_metrics(workspace: Workspace, dataset: str) -> Made:
@@ -46,15 +44,8 @@ metrics = stage(
     METRICS,
     _make_metrics,
     group=GROUP,
-    deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset), judges],
+    parents=[items, of(verdicts, by_dataset, need="some"), judges],
     scheme=DATASET,
-    needs={"verdicts": "some"},
-    columns={
-        **_SHARES,
-        "acc": ["verdicts.correct"],
-        "abs_rec": ["verdicts.abstained"],
-        "false_abs": ["verdicts.abstained"],
-    },
     checks=[
         Check(
             "shares_are_shares",
@@ -106,7 +97,7 @@ def _make_leaderboard(workspace: Workspace, _: None) -> Made:
     board = rank(cells, intervals(resample(judged)), workspace.tables.read(CONTRASTS, {}))
     overall = board.loc[board["dataset"] == "overall", "pecs"].to_numpy(float)
     best = {"best overall PECS": float(overall.max())} if len(overall) else {}
-    return Made(board, shown={"leaderboard": dg.MetadataValue.md(leaderboard_markdown(board))} | best)
+    return Made(board, shown={"leaderboard": Markdown(leaderboard_markdown(board))} | best)
 
 
 def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
@@ -158,18 +149,16 @@ def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:
     return f"{wrong} rows are wrong" if wrong else ""
 
 
-_OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
 # The panel is an input of all that is counted from its verdicts: after a change of it they are stale at once, and not
 # only when its votes are made again.
-contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME)
-regime_tests = stage(REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME)
+_SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
+contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, parents=_SCORED)
+regime_tests = stage(REGIME_TESTS, _make_regime_tests, group=GROUP, parents=_SCORED)
 leaderboard = stage(
     LEADERBOARD,
     _make_leaderboard,
     group=GROUP,
-    deps=[metrics, verdicts, contrasts, judges],
-    needs=_OF_SOME,
-    columns={name: [f"metrics.{name}"] for name in ("acc", "abs_rec", "false_abs", "j", "pecs")},
+    parents=[*_SCORED, contrasts],
     checks=[
         Check(
             "intervals_ordered",
@@ -182,9 +171,7 @@ robust = stage(
     ROBUST,
     _make_robust,
     group=GROUP,
-    deps=[metrics, verdicts, judges],
-    needs=_OF_SOME,
-    columns={"acc_r": ["verdicts.correct"], "abs_rec_r": ["verdicts.abstained"], "false_abs_r": ["verdicts.abstained"]},
+    parents=_SCORED,
     checks=[
         Check(
             "robust_rows_hold",
@@ -197,9 +184,7 @@ hypotheses = stage(
     HYPOTHESES,
     _make_hypotheses,
     group=GROUP,
-    deps=[items, metrics, verdicts, judges],
-    needs={**_OF_SOME, "items": "some"},
-    columns={"acc": ["verdicts.correct"], "abs_rec": ["verdicts.abstained"], "false_abs": ["verdicts.abstained"]},
+    parents=[of(items, need="some"), *_SCORED],
     checks=[
         Check(
             "doses_hold",

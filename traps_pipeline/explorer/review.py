@@ -249,7 +249,7 @@ class Review:
         """The contact strip: frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
         import cv2
 
-        from traps_pipeline.scenes.encode import decode
+        from traps_pipeline.scenes.picture.encode import decode
 
         self.spec(scenario_id)
         both = [decode(self.clip(scenario_id, side))[0] for side in ("control", "void")]

@@ -19,13 +19,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import SITES, Patch, patched_changes, record, require_patchable
-from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.model import LocalModel
 from traps_pipeline.models.local.prefixes import PrefixMemory, resumable
-from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.selfcheck import tiny_model
 from traps_pipeline.models.local.spans import spans
 from traps_pipeline.models.local.tiny import Family
+from traps_pipeline.models.local.vision_cache import ClipMemory
 
 if TYPE_CHECKING:
     from torch import Tensor

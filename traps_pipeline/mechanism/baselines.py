@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.workspace import Workspace
 

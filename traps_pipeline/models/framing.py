@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.scenes.policies import FramePolicy
+from traps_pipeline.scenes.picture.policies import FramePolicy
 from traps_pipeline.storage.media import MediaSpec
 
 _RATES = {"frames_few": 2, "frames_all": 10}  # frames a second

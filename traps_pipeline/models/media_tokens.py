@@ -9,7 +9,7 @@ from collections.abc import Callable
 from math import ceil
 
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import Profile
 
 Size = tuple[int, int]  # width and height in pixels

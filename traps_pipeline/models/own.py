@@ -130,7 +130,7 @@ def _read(path: Path) -> Own:
     try:
         return Own.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        raise TrapsError(f"{path}: {explain(error)}") from error
+        raise TrapsError(f"{path}: {explain(error, Own)}") from error
 
 
 def _yaml(own: Own) -> str:

@@ -20,15 +20,17 @@ from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import load_accounts, load_models
+from traps_pipeline.orchestration.assets import WorkspaceResource
 from traps_pipeline.orchestration.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.machine import require_machine, wanted_parts
 from traps_pipeline.orchestration.ranges import batches
-from traps_pipeline.orchestration.run import failed_checks, pending_in, walk
+from traps_pipeline.orchestration.run import pending_in, walk
 from traps_pipeline.orchestration.runs import RunsHere, range_tags
-from traps_pipeline.orchestration.stage import WorkspaceResource
+from traps_pipeline.orchestration.selection import failed_checks
 from traps_pipeline.orchestration.step import CURRENT, MAKE_TAG, OUTDATED, STALE
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
 
@@ -62,14 +64,14 @@ def reread_sources() -> None:
 def jobs() -> list[Any]:
     """Return a job for each part of the graph and one for all of it, once the stages are declared."""
     stages = the_graph().stages
-    parts = {name: [s for s in stages if s.spec.group_name in groups] for name, groups in JOB_GROUPS.items()}
+    parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
     every = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
     return [*(_job(name, DESCRIPTIONS[name], part) for name, part in parts.items() if part), every]
 
 
 def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
     if all(stage.scheme is None for stage in stages):
-        selection = dg.AssetSelection.assets(*(stage.spec.key for stage in stages))
+        selection = dg.AssetSelection.assets(*(asset_key(stage.name) for stage in stages))
         return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE})
 
     @dg.op(name=f"make_{name}", description=doc)
@@ -112,7 +114,7 @@ def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: 
                 reported.add(text)
                 instance.report_runless_asset_event(
                     dg.AssetCheckEvaluation(
-                        asset_key=stage.spec.key,
+                        asset_key=asset_key(stage.name),
                         check_name=CURRENT,
                         passed=False,
                         partition=key,
@@ -137,7 +139,7 @@ def _requests(
                     digest([*one, seen])[:32],
                     partition_key=one[0] if one[0] == one[1] else None,
                     tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(one)},
-                    asset_selection=[stage.spec.key for stage in stages],
+                    asset_selection=[asset_key(stage.name) for stage in stages],
                 )
             )
     return requests
@@ -148,7 +150,7 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
 
     @dg.sensor(
         name=name,
-        asset_selection=dg.AssetSelection.assets(*(stage.spec.key for stage in _stages(costs))),
+        asset_selection=dg.AssetSelection.assets(*(asset_key(stage.name) for stage in _stages(costs))),
         minimum_interval_seconds=INTERVAL_S,
         default_status=dg.DefaultSensorStatus.STOPPED if costs else dg.DefaultSensorStatus.RUNNING,
         description=doc,

@@ -38,6 +38,7 @@ from traps_pipeline.orchestration.runs import (
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.orchestration.step import TAKEN, TALLY
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.database import PATIENCE_S
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
@@ -197,7 +198,7 @@ class RayRuns(Runs):
 
         (location,) = self._context.code_locations
         (repository,) = location.get_repositories().values()
-        selected = frozenset(stage.spec.key for stage in stages)
+        selected = frozenset(asset_key(stage.name) for stage in stages)
         selector = JobSubsetSelector(location.name, repository.name, "__ASSET_JOB", None, selected)
         job = location.get_job(selector)
         plan = location.get_execution_plan(job, {}, None, None, instance=self._instance)
@@ -349,7 +350,7 @@ def keys_in(stages: Sequence[Stage], of: Range) -> Sequence[str]:
     scheme, (first, last) = stages[0].scheme if stages else None, of
     if scheme is None or first is None:
         return []
-    return [*scheme.definition.get_partition_keys_in_range(dg.PartitionKeyRange(first, str(last)))]
+    return scheme.between(first, str(last))
 
 
 def _partitions(run: dg.DagsterRun) -> int:

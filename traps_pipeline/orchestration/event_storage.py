@@ -2,7 +2,8 @@
 
 For each event Dagster makes an engine, which compiles its statements anew, and opens and closes the file. Here the
 engine of a file is kept. Its commits go to SQLite's log beside the file, which Dagster's pages do not watch, so the
-file is touched after each. `dagster.yaml` names this class; a study may name another storage in its own.
+file is touched after each that changes something. `dagster.yaml` names this class; a study may name another storage in
+its own.
 """
 
 import contextlib
@@ -51,6 +52,11 @@ def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
         raise unwritable from None
 
 
+def _changes(connection: db.Connection) -> int:
+    """Return how many rows this connection has changed since it was opened."""
+    return connection.connection.driver_connection.total_changes  # pyright: ignore[reportOptionalMemberAccess]
+
+
 def _kept_engine(address: str) -> db.Engine:
     engine = db.create_engine(address, connect_args={"timeout": _BUSY_S})
     # A power cut may take the last events, never the history; what counts stands in the tables' footers.
@@ -72,9 +78,12 @@ class _EventStorage(SqliteEventLogStorage):
                 self._initdb(engine)
                 self._initialized_dbs.add(shard)
             with _transaction(engine) as connection:
+                before = _changes(connection)
                 yield connection
-            with contextlib.suppress(FileNotFoundError):
-                os.utime(self.path_for_shard(shard))
+                is_changed = _changes(connection) != before
+            if is_changed:
+                with contextlib.suppress(FileNotFoundError):
+                    os.utime(self.path_for_shard(shard))
 
     def _engine(self, shard: str) -> db.Engine:
         with self._engines_lock:

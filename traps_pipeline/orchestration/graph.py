@@ -1,7 +1,7 @@
-"""What each partition is made from, which keys there are, and in which order: a view of the assets' own specs.
+"""What each partition is made from, which keys there are, and in which order.
 
-`stage` and `source` (`orchestration.stage`) are the only declarations. This module reads Dagster's specs and adds what
-Dagster has no words for: how much of a parent is needed, and what making a partition costs.
+`stage` and `source` (`orchestration.stage`) are the only declarations. Nothing here imports Dagster: `traps status`,
+`why` and `plan` read this graph and the tables' footers alone, and `orchestration.assets` makes Dagster's assets of it.
 """
 
 from __future__ import annotations
@@ -9,19 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, Literal
-
-import dagster as dg
+from typing import Any, Literal
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.orchestration.partitioning import EVERY, SAME, KeyMapping, Scheme
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-
-if TYPE_CHECKING:
-    from traps_pipeline.orchestration.schemes import Scheme
 
 Node = tuple[str, str | None]  # stage or source, and its partition key
 Need = Literal["every", "some", "none"]
@@ -51,11 +47,24 @@ class Check:
 
 
 @dataclass(frozen=True)
+class Parent:
+    """What a stage is made from. mapping: which of its partitions (default: that of the same key where both are
+    partitioned alike, else every one); need: how much of what the study wants of them must be there."""
+
+    name: str
+    mapping: KeyMapping | None = None
+    need: Need = "every"
+
+
+@dataclass(frozen=True)
 class Source:
     """Something that people edit. version: of its content, by partition where it has any."""
 
-    spec: dg.AssetSpec
+    name: str
     version: Callable[[Workspace, Any], str]
+    group: str
+    doc: str
+    kinds: Sequence[str]
     scheme: Scheme | None = None
 
 
@@ -85,34 +94,39 @@ class Shared:
 
 
 @dataclass(frozen=True)
+class Collect:
+    """Makes several partitions side by side, and hands each on when it is done."""
+
+    partitions: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]]
+
+
+Make = Callable[[Workspace, Any], Made]  # makes one partition
+
+
+@dataclass(frozen=True)
 class Stage:
     """Something that is made: a table, or files for people (table: None).
 
-    make makes one partition, collect several side by side and hands each on when it is done. needs: how much of each
-    parent must be there, by name (default: every partition that the study wants). code: raise it when the formula
-    changes, and what was made before is stale. cost: what making it takes besides seconds. wants: whether a study wants
-    a key at all. lost: what is missing of the files that a partition names. takes: what a run of it takes of a host.
-    shared: how several runs make a partition at once, where they may.
+    code: raise it when the formula changes, and what was made before is stale. cost: what making it takes besides
+    seconds. wants: whether a study wants a key at all. lost: what is missing of the files that a partition names.
+    takes: what a run of it takes of a host. shared: how several runs make a partition at once, where they may.
     """
 
-    spec: dg.AssetSpec
+    name: str
     table: Table | None
-    make: Callable[[Workspace, Any], Made] | None
-    collect: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]] | None
+    make: Make | Collect
+    group: str
+    parents: Mapping[str, Parent]
+    doc: str
     scheme: Scheme | None
-    needs: Mapping[str, Need]
     checks: Sequence[Check]
+    kinds: Sequence[str]
     code: str
     cost: Cost
     wants: Callable[[Wanted, Any], bool]
     lost: Callable[[Workspace, Any], list[str]]
     takes: Takes = Takes()
     shared: Shared | None = None
-
-    @property
-    def name(self) -> str:
-        """Its name: that of its table."""
-        return self.spec.key.path[-1]
 
     def columns(self, key: str | None) -> Mapping[str, Any]:
         """Values of the table's partition columns for a key."""
@@ -134,12 +148,9 @@ class Graph:
     declared: Mapping[str, Stage | Source] = field(default_factory=lambda: DECLARED)
 
     @cached_property
-    def parents_of(self) -> Mapping[str, Mapping[str, dg.AssetDep]]:
-        """What a stage is made from, by name, with Dagster's partition mapping."""
-        return {
-            name: {dep.asset_key.path[-1]: dep for dep in one.spec.deps} if isinstance(one, Stage) else {}
-            for name, one in self.declared.items()
-        }
+    def parents_of(self) -> Mapping[str, Mapping[str, Parent]]:
+        """What a stage is made from, by name; nothing for a source."""
+        return {name: one.parents if isinstance(one, Stage) else {} for name, one in self.declared.items()}
 
     def __getitem__(self, name: str) -> Stage:
         one = self.declared.get(name)
@@ -172,7 +183,7 @@ class Graph:
             ready = [name for name in left if not above[name] & left.keys()]
             if not ready:
                 raise TrapsError(f"the graph has a circle among {', '.join(left)}")
-            first = min(ready, key=lambda name: GROUPS.index(left[name].spec.group_name or ""))
+            first = min(ready, key=lambda name: GROUPS.index(left[name].group))
             scheme, block = left[first].scheme, list[Stage]()
             while ready:
                 block += [left.pop(name) for name in ready if left[name].scheme is scheme]
@@ -203,28 +214,24 @@ class Graph:
     def keys(self, name: str) -> list[str | None]:
         """All partition keys of a stage or source."""
         scheme = self.declared[name].scheme
-        return [None] if scheme is None else [str(key) for key in scheme.definition.get_partition_keys()]
+        return [None] if scheme is None else [*scheme.keys]
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
         """Every partition that a partition may be made from, whether it is there or not: keys by stage or source."""
         scheme = self.declared[name].scheme
-        if key not in self.keys(name):
+        if key is not None and (scheme is None or key not in scheme.known):
             return {}  # of an experiment that the study has no more
-        child = None if scheme is None else scheme.definition
-        wanted = child.subset_with_partition_keys([key]) if child is not None and key is not None else None
-        found: dict[str, Sequence[str | None]] = {}
-        for parent, dep in self.parents_of[name].items():
-            over = self.declared[parent].scheme
-            if over is None:
-                found[parent] = [None]
-                continue
-            same = dg.IdentityPartitionMapping() if over is scheme else dg.AllPartitionMapping()
-            mapped = (dep.partition_mapping or same).get_upstream_mapped_partitions_result_for_partitions(
-                wanted, child, over.definition
-            )
-            found[parent] = [str(k) for k in mapped.partitions_subset.get_partition_keys()]
-        return found
+        return {
+            parent.name: [None] if (above := self.declared[parent.name].scheme) is None
+            else self.mapping(name, parent.name).above(key, scheme, above)
+            for parent in self.parents_of[name].values()
+        }  # fmt: skip
+
+    def mapping(self, name: str, parent: str) -> KeyMapping:
+        """Which partitions of a partitioned parent a stage is made from."""
+        scheme, stated = self.declared[name].scheme, self.parents_of[name][parent].mapping
+        return stated or (SAME if scheme is self.declared[parent].scheme else EVERY)
 
 
 def name_of(node: Node) -> str:
@@ -234,7 +241,7 @@ def name_of(node: Node) -> str:
 
 @cache
 def the_graph() -> Graph:
-    """The graph of everything that is declared, once `traps_pipeline.definitions` is loaded."""
+    """The graph of everything that is declared, once `traps_pipeline.defs` is imported."""
     if not DECLARED:
-        raise RuntimeError("no stage is declared yet: import traps_pipeline.definitions first")
+        raise RuntimeError("no stage is declared yet: import traps_pipeline.defs first")
     return Graph()

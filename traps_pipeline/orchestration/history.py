@@ -11,6 +11,7 @@ import dagster as dg
 from traps_pipeline.orchestration.graph import Graph, Node, Stage
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.metadata import visible_metadata
+from traps_pipeline.orchestration.translation import asset_key
 
 _VERSION, _USER, _CODE = "dagster/data_version", "dagster/data_version_is_user_provided", "dagster/code_version"
 _INPUT_VERSION, _INPUT_POINTER = "dagster/input_data_version", "dagster/input_event_pointer"
@@ -29,14 +30,17 @@ class History:
     ) -> dg.AssetMaterialization:
         """The event that makes a partition count as made, with its data version and what it was made from."""
         tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
-        return dg.AssetMaterialization(stage.spec.key, partition=key, metadata=visible_metadata(metadata), tags=tags)
+        return dg.AssetMaterialization(
+            asset_key(stage.name), partition=key, metadata=visible_metadata(metadata), tags=tags
+        )
 
     def provenance(self, stage: Stage) -> dict[str, str]:
         """Tags that say which events of the parents are current. Taken before anything is read."""
         tags: dict[str, str] = {}
-        for dep in stage.spec.deps:
-            name, parent = dep.asset_key.to_user_string(), dep.asset_key.path[-1]
-            found = self._fetch(parent)(dg.AssetRecordsFilter(asset_key=dep.asset_key), limit=1).records
+        for parent in stage.parents:
+            key = asset_key(parent)
+            name = key.to_user_string()
+            found = self._fetch(parent)(dg.AssetRecordsFilter(asset_key=key), limit=1).records
             version = _version_of(found[0]) if found else None
             tags[f"{_INPUT_VERSION}/{name}"] = version or NEVER
             tags[f"{_INPUT_POINTER}/{name}"] = str(found[0].storage_id) if found else "NULL"
@@ -46,11 +50,11 @@ class History:
         """The data version that Dagster knows of each partition of a stage or source."""
         node = self._graph.declared[name]
         if node.scheme is None:
-            found = self._fetch(name)(dg.AssetRecordsFilter(asset_key=node.spec.key), limit=1).records
+            found = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
             return {None: _version_of(found[0])} if found else {}
         # One query over the index of tags: ten thousand events take seconds to deserialize.
         kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MADE
-        tags = self._instance.event_log_storage.get_latest_tags_by_partition(node.spec.key, kind, [_VERSION])
+        tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])
         return {key: of[_VERSION] for key, of in tags.items()}
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
@@ -64,8 +68,9 @@ class History:
             recorded = self.recorded(name)
             for key, version in now.items():
                 if recorded.get(key) != version:
-                    tags, asset_key = {_VERSION: version, _USER: "true"}, self._graph.declared[name].spec.key
-                    self._instance.report_runless_asset_event(dg.AssetObservation(asset_key, partition=key, tags=tags))
+                    tags = {_VERSION: version, _USER: "true"}
+                    event = dg.AssetObservation(asset_key(name), partition=key, tags=tags)
+                    self._instance.report_runless_asset_event(event)
                     changed.append((name, key))
             _OBSERVED[slot] = now
         return changed

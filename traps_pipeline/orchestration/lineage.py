@@ -85,7 +85,7 @@ class Lineage:
                 continue
             wanted = [k for k in keys if k in self._wanted(parent)]
             wrong = {k: why for k in wanted if (why := self._unusable(parent, k, current))}
-            need = stage.needs.get(parent, "every")
+            need = stage.parents[parent].need
             if need != "none" and wrong and (need == "every" or len(wrong) == len(wanted)):
                 first, why = next(iter(wrong.items()))
                 more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
@@ -97,12 +97,12 @@ class Lineage:
     def waits(self, name: str, key: str | None) -> bool:
         """Whether something above a partition is outdated itself or must be made first: it would be made twice. What
         costs money, and can be done without, may never come and is not waited for."""
-        needs = self.graph[name].needs
+        of_stage = self.graph[name].parents
         parents = {
             parent: keys
             for parent, keys in self.graph.parents(name, key).items()
             if not self.graph.source(parent)
-            and not (needs.get(parent) == "none" and self.graph[parent].cost == "money")
+            and not (of_stage[parent].need == "none" and self.graph[parent].cost == "money")
         }
         above = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
         return any(self.status(*node).outdated for node in above) or bool(self.blocked(name, key, current=True))

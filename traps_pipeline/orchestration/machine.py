@@ -7,8 +7,7 @@ import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-
-import dagster as dg
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network
@@ -19,8 +18,11 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.scenes.trial import OPENGL, check_rendering
+from traps_pipeline.scenes.picture.trial import OPENGL, check_rendering
 from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import dagster as dg
 
 LEAST_GB = 0.1  # less is gone before a run has made its first tables
 SHOWN = 5  # partitions in a sentence
@@ -62,9 +64,7 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
     if any(entry.backend == NETWORK for entry in _asked(workspace, parts)):
         check_network()
     graph = the_graph()
-    drawing = (
-        (graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].spec.kinds
-    )
+    drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
     if any(shared is not None and shared.seconds(workspace, key) > 0 for shared, key in drawing):
         _check_rendering(*(os.environ.get(name) for name in OPENGL))
 

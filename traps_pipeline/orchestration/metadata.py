@@ -9,6 +9,7 @@ from typing import Any, cast
 import dagster as dg
 
 from traps_pipeline.base.terminal import visible
+from traps_pipeline.orchestration.previews import Markdown, Records, StudyFile
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.tables import Table
 
@@ -19,6 +20,12 @@ def visible_metadata(value: Any) -> Any:
     """Return a value of an event's metadata, or a mapping or list of them, with hidden characters made visible."""
     if isinstance(value, str):
         return visible(value)
+    if isinstance(value, Markdown):
+        return dg.MetadataValue.md(visible(value.text))
+    if isinstance(value, Records):
+        return dg.MetadataValue.table([dg.TableRecord(visible_metadata(row)) for row in value.rows])
+    if isinstance(value, StudyFile):
+        return dg.MetadataValue.path(value.path)
     if isinstance(value, dg.MarkdownMetadataValue):
         return dg.MetadataValue.md(visible(value.md_str or ""))
     if isinstance(value, dg.TableMetadataValue):

@@ -9,10 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-import dagster as dg
 import numpy as np
 
-from traps_pipeline.orchestration.schemes import Scheme
+from traps_pipeline.orchestration.partitioning import Scheme
 
 Range = tuple[str | None, str | None]  # first and last key
 _Corners = tuple[int, int, int, int]  # first and last row, first and last column
@@ -28,12 +27,8 @@ class _Grid:
 
     @staticmethod
     def of(scheme: Scheme) -> _Grid:
-        if isinstance(scheme.definition, dg.MultiPartitionsDefinition):
-            rows, columns = (
-                [str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs
-            )
-            return _Grid(rows, columns)
-        return _Grid([""], [str(key) for key in scheme.definition.get_partition_keys()])
+        *rows, columns = scheme.dimensions.values()
+        return _Grid(rows[0] if rows else [""], columns)
 
     def cells(self, keys: Iterable[str | None]) -> Iterator[tuple[int, int]]:
         """Row and column of each key."""

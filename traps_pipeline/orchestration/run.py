@@ -18,7 +18,7 @@ from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
-from traps_pipeline.orchestration.graph import Stage, name_of, the_graph
+from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, Runs, this_host
@@ -153,41 +153,3 @@ def walk(
     outcome.problems = [*dict.fromkeys(outcome.problems)]
     outcome.seconds = time.monotonic() - began
     return outcome
-
-
-def stages_until(until: str | None) -> set[str]:
-    """All stages; with `until` (names with commas between), these and what they are made from. Raises TrapsError."""
-    graph = the_graph()
-    if until is None:
-        return {stage.name for stage in graph.stages}
-    known = [stage.name for stage in graph.stages]
-    if unknown := [name for name in until.split(",") if name not in known]:
-        raise TrapsError(f"--until {', '.join(unknown)}: no such stage; choose from {', '.join(known)}")
-    return graph.above(until.split(","))
-
-
-def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
-    """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
-    wanted, graph = Wanted(workspace, experiment), the_graph()
-    if not wanted.cells and not wanted.states:
-        raise TrapsError(
-            f"experiment {experiment} asks nothing: none of its scenarios belongs to its datasets, or no model has its "
-            "runs; change `scenarios`, `datasets` or `runs`"
-        )
-    if empty := [name for name in until.split(",") if not graph[name].wanted(wanted)] if until else []:
-        raise TrapsError(f"--until {', '.join(empty)}: experiment {experiment} wants nothing of it; name another stage")
-
-
-def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
-    """Checks of what is wanted that do not pass, whichever run made it."""
-    wanted, problems = Wanted(workspace, experiment), []
-    for stage in the_graph().stages:
-        for key in stage.wanted(wanted):
-            for check in workspace.failed_checks(stage.name, key):
-                details = workspace.failure(stage.name, check, key)
-                problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
-    return problems
-
-
-def _unquoted(details: str) -> str:
-    return details[1:-1] if details[:1] == details[-1:] == '"' else details

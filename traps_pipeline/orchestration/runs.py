@@ -19,6 +19,7 @@ from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.ranges import Range, batches
 from traps_pipeline.orchestration.step import close_dropped
+from traps_pipeline.orchestration.translation import asset_key
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
 PARENT_TAG, ROOT_TAG = "dagster/parent_run_id", "dagster/root_run_id"
@@ -88,7 +89,7 @@ class RunsHere(Runs):
         try:
             result = self._job.execute_in_process(
                 instance=self._instance,
-                asset_selection=[stage.spec.key for stage in stages],
+                asset_selection=[asset_key(stage.name) for stage in stages],
                 partition_key=key,
                 tags={**self._tags, **tags, **range_tags(one)},
                 raise_on_error=False,

@@ -20,15 +20,16 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.redaction import redacted
+from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.models.budget import BudgetReached
-from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
+from traps_pipeline.orchestration.graph import Collect, Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
 from traps_pipeline.orchestration.metadata import preview, visible_metadata
 from traps_pipeline.orchestration.same_code import require_same_code
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.scenes.workers import kept_workers
 from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.workspace import Workspace
@@ -176,20 +177,20 @@ class Step:
         self, todo: Sequence[str | None], inputs: Mapping[str | None, Mapping[str, str]]
     ) -> Iterator[tuple[str | None, Made]]:
         """Each partition as it is done. One that ends in a sentence leaves the others to be made."""
-        if self.stage.make is not None:
+        make = self.stage.make
+        if not isinstance(make, Collect):
             for key, done in self._beside_others(todo, inputs):
                 try:
-                    made = self.stage.make(self.workspace, key)
+                    made = make(self.workspace, key)
                 except TrapsError as error:
                     self.unmade[key] = error
                     continue
                 made.tally.add(done)
                 yield key, made
             return
-        assert self.stage.collect is not None, "a stage makes or collects"
         left = [*todo]
         try:
-            for key, made in self.stage.collect(self.workspace, [str(key) for key in todo]) if todo else ():
+            for key, made in make.partitions(self.workspace, [str(key) for key in todo]) if todo else ():
                 left.remove(key)
                 yield key, made
         except TrapsError as error:
@@ -362,7 +363,11 @@ def to_make(
 
 def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
     return dg.AssetCheckEvaluation(
-        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata=visible_metadata(wrong)
+        asset_key=asset_key(stage.name),
+        check_name=check,
+        passed=not wrong,
+        partition=key,
+        metadata=visible_metadata(wrong),
     )
 
 

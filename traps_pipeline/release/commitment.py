@@ -21,11 +21,11 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record
-from traps_pipeline.scenes.sample import load_tallies, sample_family
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
-from traps_pipeline.scenes.workers import kept_workers
+from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 _HEX = r"^[0-9a-f]{64}$"
 # What a record says of arithmetic: another CPU or another version of the simulator may draw the same scene otherwise.

@@ -27,9 +27,9 @@ from traps_pipeline.release.tables import (
     ScenarioRow,
     SplitRow,
 )
-from traps_pipeline.scenes.certificates import certificates_for, pair_of, stored_evidence
-from traps_pipeline.scenes.evidence import Claim
-from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of, stored_evidence
+from traps_pipeline.scenes.certification.evidence import Claim
+from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import LITE_FILE
 

@@ -12,8 +12,8 @@ import pandas as pd
 
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
-from traps_pipeline.scenes.encode import decode
-from traps_pipeline.scenes.vision import before_panel
+from traps_pipeline.scenes.parts.vision import before_panel
+from traps_pipeline.scenes.picture.encode import decode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

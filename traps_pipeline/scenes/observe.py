@@ -9,11 +9,11 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from traps_pipeline.scenes.encode import decode_sampled
-from traps_pipeline.scenes.kit import Family
-from traps_pipeline.scenes.policies import SAMPLED, FramePolicy
-from traps_pipeline.scenes.registry import families
-from traps_pipeline.scenes.wording import asked
+from traps_pipeline.scenes.family_registry import families
+from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.physics.kit import Family
+from traps_pipeline.scenes.picture.encode import decode_sampled
+from traps_pipeline.scenes.picture.policies import SAMPLED, FramePolicy
 
 
 @cache

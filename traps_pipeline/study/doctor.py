@@ -18,7 +18,7 @@ from traps_pipeline.base.files import PART
 from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
 from traps_pipeline.orchestration.machine import check_disk
-from traps_pipeline.scenes.trial import draw_frame, encode_clip
+from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -176,7 +176,7 @@ def _damaged_journal(root: Path) -> Iterator[str]:
 
 
 def _damaged_clip(path: Path) -> str:
-    from traps_pipeline.scenes.clips import DamagedClip, read_clip
+    from traps_pipeline.scenes.worlds.clips import DamagedClip, read_clip
 
     try:
         read_clip(path)
@@ -186,7 +186,7 @@ def _damaged_clip(path: Path) -> str:
 
 
 def _damaged_media(note: Path) -> str:
-    from traps_pipeline.scenes.encode import DamagedClip
+    from traps_pipeline.scenes.picture.encode import DamagedClip
     from traps_pipeline.storage.media import payload, read_note
 
     try:

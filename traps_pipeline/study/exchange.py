@@ -316,7 +316,7 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
         try:
             answer = Answer.model_validate(json.loads(line))
         except ValidationError as error:
-            wrong.append(f"{path}:{number}: {explain(error)}")
+            wrong.append(f"{path}:{number}: {explain(error, Answer)}")
             continue
         except (ValueError, RecursionError) as error:
             wrong.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")

@@ -36,7 +36,7 @@ from traps_pipeline.models.reading import degenerate, read_answer
 from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of, effective_params
 from traps_pipeline.models.request import MALFORMED, UNFINISHED, WITH_TEXT, Outcome, Request, TransientError
 from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore
 from traps_pipeline.storage.workspace import Workspace
 

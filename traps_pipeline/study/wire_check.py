@@ -27,7 +27,7 @@ from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, sample
 from traps_pipeline.study.loopback import PLACEHOLDER_KEY, render
 from traps_pipeline.study.wire_body import (

@@ -36,7 +36,7 @@ from traps_pipeline.models.local import model as local_model
 from traps_pipeline.models.local.adapter import Sampling, load_local_model
 from traps_pipeline.models.local.checkpoint import folder_digest, weight_bytes
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompts import batches, collate
+from traps_pipeline.models.local.prompt_batches import batches, collate
 from traps_pipeline.models.local.sampling import SeededNucleus
 from traps_pipeline.models.local.settings import MechanismSpec
 from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer

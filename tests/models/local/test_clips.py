@@ -7,8 +7,8 @@ import torch
 
 from tests.local_models import FAMILIES, Family, ask, direction, model, three_prompts
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local.clips import ClipMemory
-from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.prompt_batches import Prompt
+from traps_pipeline.models.local.vision_cache import ClipMemory
 
 pytestmark = pytest.mark.slow
 

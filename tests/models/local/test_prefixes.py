@@ -15,7 +15,7 @@ from tests.local_models import FAMILIES, Family, ask, direction, model, three_pr
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import LocalModel, Sampling
 from traps_pipeline.models.local.prefixes import PrefixMemory, resumed, without_pictures
-from traps_pipeline.models.local.prompts import collate
+from traps_pipeline.models.local.prompt_batches import collate
 
 pytestmark = pytest.mark.slow
 

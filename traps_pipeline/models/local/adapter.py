@@ -21,7 +21,7 @@ from traps_pipeline.base.extras import require
 from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory, require_no_code
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import Generated, LocalModel, States
-from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.settings import LocalParams
 from traps_pipeline.models.registry import ModelEntry

@@ -19,7 +19,7 @@ from traps_pipeline.models.framing import framed
 from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 
 GATHER_S = 0.01  # after the first waiting request, for those that the same answers have set free

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prefixes import Resumable, resumed, without_pictures
-from traps_pipeline.models.local.prompts import Prompt, collate
+from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
 
 if TYPE_CHECKING:

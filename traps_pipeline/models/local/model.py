@@ -15,13 +15,13 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
-from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.decoding import Steers, decode, steered
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prefixes import PrefixMemory
-from traps_pipeline.models.local.prompts import Prompt, batches
+from traps_pipeline.models.local.prompt_batches import Prompt, batches
 from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.settings import LocalParams
+from traps_pipeline.models.local.vision_cache import ClipMemory
 
 if TYPE_CHECKING:
     from torch import Tensor

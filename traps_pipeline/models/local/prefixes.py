@@ -20,7 +20,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, Protocol
 
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.sidepaths import SHARED, given, unknown_path
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ from traps_pipeline.base.extras import install_line, missing
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.checkpoint import download_command, find_checkpoint
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.settings import Quantisation
 from traps_pipeline.models.local.tiny import Family, build_tiny
 from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
-from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec, sample
 
 _SPEC = MediaSpec(profile="frames", uniform=4)

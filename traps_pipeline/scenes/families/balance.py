@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
+from traps_pipeline.scenes.parts.course import DEAD, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD
-from traps_pipeline.scenes.parts.outcome import Reading, lasting_from
 from traps_pipeline.scenes.parts.questions import Filled, Question, colour_of, comes_from
-from traps_pipeline.scenes.parts.stage import DEAD, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, lasting_from
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import colour_mask, largest
+from traps_pipeline.scenes.parts.vision import colour_mask, largest
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box
 
 BEAM_HALF_M = 0.012  # half thickness of the beam
 CUP_M = 0.035  # height of the cup's walls
@@ -65,7 +65,7 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Shelf and beam before a board that carries the beam and catches the shadows."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side = p.radius_m, 1.7 * p.radius_m
     sin, cos = np.sin(np.radians(p.tilt_deg)), np.cos(np.radians(p.tilt_deg))
     drop_at = float(p.arm_m * cos - (BEAM_HALF_M + r) * sin)  # before the pivot, over the cup of the raised arm
@@ -74,38 +74,38 @@ def build(p: Params, physics: Physics) -> Scene:
     panel_at, end, high = -p.half_beam_m - 0.03, p.half_beam_m + 0.03, z + 2 * r + 0.02
     start, deep, over = panel_at - p.run_m, (-side, side), (z, z + 0.3 * r)
 
-    stage.block("table", (start, panel_at), deep, (0, z), p.shelf_colour)
-    stage.block("shelf", (panel_at, edge), deep, (z - 0.012, z), p.shelf_colour)
-    stage.block("shelf_front", (start, edge), (-side, -side + 0.012), over, p.board_colour)
-    stage.block("shelf_back", (start, edge), (side - 0.012, side), over, p.board_colour)
+    course.block("table", (start, panel_at), deep, (0, z), p.shelf_colour)
+    course.block("shelf", (panel_at, edge), deep, (z - 0.012, z), p.shelf_colour)
+    course.block("shelf_front", (start, edge), (-side, -side + 0.012), over, p.board_colour)
+    course.block("shelf_back", (start, edge), (side - 0.012, side), over, p.board_colour)
     behind = (stop, stop + 0.012), (-0.6 * side, side), (z - 0.01, z + 1.5 * r)
-    backstop = stage.block("backstop", *behind, p.shelf_colour)
+    backstop = course.block("backstop", *behind, p.shelf_colour)
     backstop.priority, backstop.solref = 1, list(DEAD)
-    stage.block("board", (panel_at, end), (side, side + 0.015), (0, high), p.board_colour)
-    stage.block("base", (-p.half_beam_m, p.half_beam_m), (-side - 0.02, side), (0, 0.025), "black")
+    course.block("board", (panel_at, end), (side, side + 0.015), (0, high), p.board_colour)
+    course.block("base", (-p.half_beam_m, p.half_beam_m), (-side - 0.02, side), (0, 0.025), "black")
     axle = (-0.016, 0.016), (-0.05, side), (p.pivot_z_m - 0.016, p.pivot_z_m + 0.016)
-    stage.block("axle", *axle, "white", solid=False)
-    _add_beam(stage, p)
+    course.block("axle", *axle, "white", solid=False)
+    _add_beam(course, p)
     at = (start + 1.2 * r, 0, z + r)
-    stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, density=BALL_DENSITY)
-    stage.mark("beam", "axle", p.beam_colour)
-    return stage.scene(
+    course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, density=BALL_DENSITY)
+    course.mark("beam", "axle", p.beam_colour)
+    return course.scene(
         p,
         decisive=["beam"],
         hidden=["counterweight"],
-        cover=stage.box((panel_at, end), (-side - 0.02, side + 0.03), (0, high + 0.02), right=0.02),
-        in_view=[stage.box((start, end), deep, (0, high))],
+        cover=course.box((panel_at, end), (-side - 0.02, side + 0.03), (0, high + 0.02), right=0.02),
+        in_view=[course.box((start, end), deep, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.beam_colour} beam", "shelf", "counterweight", "cup"],
         also=["board", "base"],
         colours=["black", "white"],
     )
 
 
-def _add_beam(stage: Stage, p: Params) -> None:
+def _add_beam(course: Course, p: Params) -> None:
     """The beam with cup and counterweight, on a hinge; it starts at the stop to which the counterweight pulls."""
     d, half = p.direction, p.direction * float(np.radians(p.tilt_deg)) / 2
     low, high = sorted((-2 * d * p.tilt_deg, 0.0))
-    body = stage.hinge("beam", (0, 0, p.pivot_z_m), damping=0.5, range_deg=(low, high))
+    body = course.hinge("beam", (0, 0, p.pivot_z_m), damping=0.5, range_deg=(low, high))
     body.quat = [float(np.cos(half)), 0.0, float(np.sin(half)), 0.0]
     joint, ball_kg = body.first_joint(), float(BALL_DENSITY * 4 / 3 * np.pi * p.radius_m**3)
     joint.stiffness, joint.springref = [STIFFNESS * (ball_kg * 9.81 * p.arm_m), 0, 0], -d * p.tilt_deg

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
-from traps_pipeline.scenes.parts.outcome import Reading, came_through
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import Span, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, came_through
 from traps_pipeline.scenes.parts.vary import (
     Drawn,
     apart,
@@ -27,6 +26,7 @@ from traps_pipeline.scenes.parts.vary import (
     one_of,
     shuffled,
 )
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 DECK_M = 0.04
 TRAY_M = 0.02  # lower than the lane, so that no ball rolls back behind the wall
@@ -70,52 +70,52 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A lane, a wall with windows and merlons before it, a tray at its end."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, rail, front = p.radius_m, 0.012, -1.35 * p.radius_m - WALL_M
     side, far = 1.25 * r, p.wall_m + p.tray_m
     second, deep, rim = p.windows_m[1], (-side, side), TRAY_M + 0.6 * r
     bed = (second - 2.5 * r, second + 1.5 * r)  # rough: a ball that bounces off the block stays there
 
-    stage.block("lane_in", (-p.run_m, bed[0]), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
-    stage.block("lane_bed", bed, deep, (0, DECK_M), p.lane_colour, Surface(0.003))
-    stage.block("lane_out", (bed[1], p.wall_m), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
-    stage.block("tray", (p.wall_m, far), deep, (0, TRAY_M), p.tray_colour, Surface(0.004))
-    stage.sides("tray", (p.wall_m, far), side, rail, (0, rim), p.tray_colour)
-    stage.block("tray_end", (far, far + rail), (-side - rail, side + rail), (0, TRAY_M + 1.5 * r), p.tray_colour)
-    _add_wall(stage, p, (front, front + WALL_M))
+    course.block("lane_in", (-p.run_m, bed[0]), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
+    course.block("lane_bed", bed, deep, (0, DECK_M), p.lane_colour, Surface(0.003))
+    course.block("lane_out", (bed[1], p.wall_m), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
+    course.block("tray", (p.wall_m, far), deep, (0, TRAY_M), p.tray_colour, Surface(0.004))
+    course.sides("tray", (p.wall_m, far), side, rail, (0, rim), p.tray_colour)
+    course.block("tray_end", (far, far + rail), (-side - rail, side + rail), (0, TRAY_M + 1.5 * r), p.tray_colour)
+    _add_wall(course, p, (front, front + WALL_M))
     stop = second + 1.1 * r  # where the block's face is: the ball rests in the window
     across = (-0.8 * r, 0.8 * r) if p.blocked else (1.5 * r, 3.1 * r)
     up = (DECK_M, DECK_M + 1.2 * r) if p.blocked else (0.0, 1.2 * r)
-    stage.block("block", (stop, stop + 0.03), across, up, p.block_colour)
-    stage.ball("ball", (1.3 * r - p.run_m, 0, DECK_M + r), r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4)
+    course.block("block", (stop, stop + 0.03), across, up, p.block_colour)
+    course.ball("ball", (1.3 * r - p.run_m, 0, DECK_M + r), r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4)
 
     high = DECK_M + 2.2 * r
-    return stage.scene(
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["block"],
-        cover=stage.cover((p.mouth_m, far + rail), (front - 0.01, 3.1 * r), high),
+        cover=course.cover((p.mouth_m, far + rail), (front - 0.01, 3.1 * r), high),
         in_view=[
-            stage.box((-p.run_m, far), (front, 3.1 * r), (0, high)),
-            stage.box((0, p.wall_m), (front, 0), (0, p.height_m + 0.05)),
+            course.box((-p.run_m, far), (front, 3.1 * r), (0, high)),
+            course.box((0, p.wall_m), (front, 0), (0, p.height_m + 0.05)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.wall_colour} wall", "lane", f"top of the {p.wall_colour} wall"],
         also=["window", "tray", "block"],
     )
 
 
-def _add_wall(stage: Stage, p: Params, across: Span) -> None:
+def _add_wall(course: Course, p: Params, across: Span) -> None:
     """The wall around its two windows, with merlons on top."""
     lintel = SILL_M + 0.62 * (p.height_m - SILL_M)
     edges = [0.0, *(at + s * p.window_m / 2 for at in p.windows_m for s in (-1, 1)), p.wall_m]
-    stage.block("wall_foot", (0, p.wall_m), across, (0, SILL_M), p.wall_colour)
-    stage.block("wall_top", (0, p.wall_m), across, (lintel, p.height_m), p.wall_colour)
+    course.block("wall_foot", (0, p.wall_m), across, (0, SILL_M), p.wall_colour)
+    course.block("wall_top", (0, p.wall_m), across, (lintel, p.height_m), p.wall_colour)
     for i in range(0, len(edges), 2):
-        stage.block(f"wall_{i}", (edges[i], edges[i + 1]), across, (SILL_M, lintel), p.wall_colour)
+        course.block(f"wall_{i}", (edges[i], edges[i + 1]), across, (SILL_M, lintel), p.wall_colour)
     pitch = p.wall_m / (2 * p.merlons - 1)
     for i in range(p.merlons):
         along = (2 * i * pitch, (2 * i + 1) * pitch)
-        stage.block(f"merlon_{i}", along, across, (p.height_m, p.height_m + 0.045), p.wall_colour)
+        course.block(f"merlon_{i}", along, across, (p.height_m, p.height_m + 0.045), p.wall_colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import DEAD, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, beyond
-from traps_pipeline.scenes.parts.outcome import Reading, crossed
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
-from traps_pipeline.scenes.parts.stage import DEAD, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, crossed
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.03  # top of the pad and of the tray
 WALL_HALF_M = 0.014
@@ -56,30 +56,30 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A table, then pad, wall and tray before a board that catches the shadows."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
     near, far, end = p.wall_at_m - WALL_HALF_M, p.wall_at_m + WALL_HALF_M, p.wall_at_m + p.tray_m
     deep, floor, over = (-side, side), (0, FLOOR_M), (0, FLOOR_M + p.wall_m)
     pad = Surface(1e-3, solref=(-50000.0, -22.0) if p.lively else DEAD, priority=2)
 
-    stage.block("table", (-p.table_m, 0), deep, (0, top), p.table_colour)
+    course.block("table", (-p.table_m, 0), deep, (0, top), p.table_colour)
     for i, y in enumerate((-side, side - rim)):
-        stage.block(f"table_rail_{i}", (-p.table_m, 0), (y, y + rim), (top, top + 0.3 * r), p.board_colour)
-    stage.block("pad", (0, near), deep, floor, p.pad_colour, pad)
-    stage.block("wall", (near, far), deep, over, p.wall_colour)
-    stage.block("tray", (far, end), deep, floor, p.tray_colour, Surface(2e-3, solref=DEAD))
-    stage.block("front_rail", (0, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.table_colour)
-    stage.block("end", (end, end + 0.02), (-side - rim, side), over, p.table_colour)
-    stage.block("board", (0, end + 0.02), (side, side + 0.015), (0, top), p.board_colour)
-    stage.ball("ball", (-p.table_m + 1.3 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
-    stage.mark("wall", "wall")
-    return stage.scene(
+        course.block(f"table_rail_{i}", (-p.table_m, 0), (y, y + rim), (top, top + 0.3 * r), p.board_colour)
+    course.block("pad", (0, near), deep, floor, p.pad_colour, pad)
+    course.block("wall", (near, far), deep, over, p.wall_colour)
+    course.block("tray", (far, end), deep, floor, p.tray_colour, Surface(2e-3, solref=DEAD))
+    course.block("front_rail", (0, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.table_colour)
+    course.block("end", (end, end + 0.02), (-side - rim, side), over, p.table_colour)
+    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, top), p.board_colour)
+    course.ball("ball", (-p.table_m + 1.3 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    course.mark("wall", "wall")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["pad"],
         # The panel begins a little beyond the edge: a ball just hidden has left the table.
-        cover=stage.box((0.03, end + 0.02), (-side - rim, side + 0.03), (0, top + 0.02), right=0.02),
-        in_view=[stage.box((-p.table_m, end), deep, (0, top))],
+        cover=course.box((0.03, end + 0.02), (-side - rim, side + 0.03), (0, top + 0.02), right=0.02),
+        in_view=[course.box((-p.table_m, end), deep, (0, top))],
         things=[f"{p.ball_colour} ball", f"{p.wall_colour} wall", "table", "tray", f"{p.pad_colour} pad"],
         also=["board"],
     )

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, SOFT, Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import end_of, rounded
-from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, SOFT, Span, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the pen's floor and of the basket's
@@ -86,20 +86,20 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Pedestal, pen with a back wall and a low front, basket."""
-    stage = Stage(physics, p.direction, Surface(0.004, solref=SOFT))
+    course = Course(physics, p.direction, Surface(0.004, solref=SOFT))
     r, rim, deep, colour = p.radius_m, p.rim_m, (-DEPTH_M, DEPTH_M), p.pen_colour
-    stage.block("pedestal", (-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m), p.pedestal_colour)
+    course.block("pedestal", (-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m), p.pedestal_colour)
     throw = (p.speed_along_m_s, p.speed_up_m_s)
-    stage.ball("ball", (0, 0, p.pedestal_m + 0.01 + r), r, p.ball_colour, thrown=throw, rolling=0.0002)
+    course.ball("ball", (0, 0, p.pedestal_m + 0.01 + r), r, p.ball_colour, thrown=throw, rolling=0.0002)
 
     low, high = p.pen_m
     pen = (low - WALL_M, high + WALL_M)
-    stage.block("pen_floor", (low, high), deep, (0, FLOOR_M), colour)
-    stage.block("pen_near", (pen[0], low), deep, (0, rim), colour)
-    stage.block("pen_far", (high, pen[1]), deep, (0, rim + 0.12), colour)
-    stage.block("pen_back", pen, (DEPTH_M, DEPTH_M + WALL_M), (0, rim), colour)
+    course.block("pen_floor", (low, high), deep, (0, FLOOR_M), colour)
+    course.block("pen_near", (pen[0], low), deep, (0, rim), colour)
+    course.block("pen_far", (high, pen[1]), deep, (0, rim + 0.12), colour)
+    course.block("pen_back", pen, (DEPTH_M, DEPTH_M + WALL_M), (0, rim), colour)
     top, middle, inner = FLOOR_M + rim, p.basket_m, DEPTH_M - 0.03
-    basket = stage.tray(
+    basket = course.tray(
         "basket",
         (middle - p.basket_half_m, middle + p.basket_half_m),
         (-inner, inner),
@@ -111,17 +111,17 @@ def build(p: Params, physics: Physics) -> Scene:
         back=top,
         front=FLOOR_M + 0.45 * r,
     )
-    stage.mark("basket", (sum(p.pen_m) / 2, DEPTH_M), p.basket_colour)  # between its two places
-    return stage.scene(
+    course.mark("basket", (sum(p.pen_m) / 2, DEPTH_M), p.basket_colour)  # between its two places
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=basket,
-        cover=stage.box(
+        cover=course.box(
             pen, (-DEPTH_M, DEPTH_M + SHADOW_BACK * (rim + 0.2)), (0, rim + 0.20), right=SHADOW_RIGHT * (rim + 0.22)
         ),
         in_view=[
-            stage.box(pen, deep, (0, rim + 0.12)),
-            stage.box((-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m)),
+            course.box(pen, deep, (0, rim + 0.12)),
+            course.box((-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.basket_colour} basket", f"{p.pedestal_colour} pedestal", "pen"],
         also=["wall"],

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import has_begun, lies_on, reaches
-from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.ramp import SteppedRamp
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 DECK_M = 0.045
 STEP_M = 0.020  # the ramp ends this high over the deck
@@ -73,38 +73,38 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Ramp, step, deck with the row between low rims, sunken box."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
     deep, outer = (-side, side), (-side - WALL_M, side + WALL_M)
     on_deck, in_box = (p.ramp_m, p.box_at_m), (p.box_at_m, end)
 
     ramp = SteppedRamp(p.ramp_m, p.slope_deg, DECK_M + STEP_M)
-    Surface(2e-5, priority=2).on(ramp.add(stage, side, p.ramp_colour))
-    LIVELY.on(stage.ball("striker", ramp.at(p.start_m, r), r, p.striker_colour))
-    stage.block("deck", on_deck, deep, (0, DECK_M), p.deck_colour, Surface(1.5e-3, sliding=0.4, priority=2))
-    stage.block("box_floor", in_box, deep, (0, BOX_FLOOR_M), p.box_colour, Surface(2e-3, sliding=0.4, priority=2))
+    Surface(2e-5, priority=2).on(ramp.add(course, side, p.ramp_colour))
+    LIVELY.on(course.ball("striker", ramp.at(p.start_m, r), r, p.striker_colour))
+    course.block("deck", on_deck, deep, (0, DECK_M), p.deck_colour, Surface(1.5e-3, sliding=0.4, priority=2))
+    course.block("box_floor", in_box, deep, (0, BOX_FLOOR_M), p.box_colour, Surface(2e-3, sliding=0.4, priority=2))
     for name, across in (("rim_front", (outer[0], -side)), ("rim_back", (side, outer[1]))):
-        stage.block(name, on_deck, across, (0, DECK_M + 0.25 * r), p.ramp_colour)
-        stage.block(f"box_{name}", in_box, across, (0, DECK_M), p.box_colour)
-    wall = stage.block("box_end", (end, end + WALL_M), outer, (0, DECK_M + r), p.box_colour)
+        course.block(name, on_deck, across, (0, DECK_M + 0.25 * r), p.ramp_colour)
+        course.block(f"box_{name}", in_box, across, (0, DECK_M), p.box_colour)
+    wall = course.block("box_end", (end, end + WALL_M), outer, (0, DECK_M + r), p.box_colour)
     wall.priority = 3  # dead: the ball stays in the box
     for name, along in zip(p.balls, p.balls_m, strict=True):
         colour = p.last_colour if name == "last" else p.row_colour
-        LIVELY.on(stage.ball(name, (along, 0, DECK_M + r), r, colour))
+        LIVELY.on(course.ball(name, (along, 0, DECK_M + r), r, colour))
     peg_at = p.balls_m[p.peg_after] + r + p.gap_m / 2
     aside, half = 0.0 if p.blocked else side + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * r) / 2
-    stage.post("peg", (peg_at, aside, half), PEG_M, half, "black").priority = 3  # dead: the ball stops at it
+    course.post("peg", (peg_at, aside, half), PEG_M, half, "black").priority = 3  # dead: the ball stops at it
 
     high = DECK_M + 2 * r
     across = (outer[0] - 0.02, outer[1] + 4 * PEG_M + SHADOW_BACK * high)
-    stage.mark("ball", "last")
-    stage.mark("box", "box_floor")
-    return stage.scene(
+    course.mark("ball", "last")
+    course.mark("box", "box_floor")
+    return course.scene(
         p,
         decisive=["last"],
         hidden=["peg"],
-        cover=stage.box((p.ramp_m - 0.04, end + WALL_M), across, (0, high), right=0.45 * high),
-        in_view=[stage.box((0, end), outer, (0, high))],
+        cover=course.box((p.ramp_m - 0.04, end + WALL_M), across, (0, high), right=0.45 * high),
+        in_view=[course.box((0, end), outer, (0, high))],
         things=[f"{p.striker_colour} ball", f"{p.last_colour} ball", f"{p.box_colour} box", "ramp"],
         also=["row", "deck", "peg"],
         colours=["black"],

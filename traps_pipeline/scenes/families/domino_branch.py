@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, listed
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course
 from traps_pipeline.scenes.parts.dominoes import BALL, BALL_AT, PLANK, STILL_M
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import end_of, struck, upper_half_stays
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.questions import left_or_right
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Stage
+from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
-from traps_pipeline.scenes.vision import blobs, colour_mask, is_panel, largest, track
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_panel, largest, track
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
 
 STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the panel, out of the domino's reach
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
@@ -60,7 +60,7 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """The row runs along -y from the first domino at the origin; the branches start where the kicked ball stops."""
-    stage, h = Stage(physics), p.height_m
+    course, h = Course(physics), p.height_m
     face = (p.visible - 1) * p.spacing + p.thickness / 2
     junction = face + STOP_AT
     reach = BALL + p.thickness + (p.branch - 1) * p.spacing + 0.65  # of a branch, when its end domino has fallen
@@ -69,26 +69,26 @@ def build(p: Params, physics: Physics) -> Scene:
     front = junction + float(reach * np.cos(angles).max()) + p.width / 2
 
     middle = (h * (right - left) / 2, -h * (front - 2.4) / 2, PLANK * h / 2)
-    stage.slab("board", middle, (h * (right + left) / 2, h * (front + 2.4) / 2, PLANK * h / 2), p.board_colour)
+    course.slab("board", middle, (h * (right + left) / 2, h * (front + 2.4) / 2, PLANK * h / 2), p.board_colour)
     for name, along in (("starter", -1.8), ("kicked", face + BALL_AT)):
         at = (0, -along * h, (PLANK + BALL) * h)
         # The board grips the ball; a domino slides over it and squeezes it out.
-        stage.ball(name, at, BALL * h, p.ball_colour, rolling=0.0004, sliding=0.1, density=300)
+        course.ball(name, at, BALL * h, p.ball_colour, rolling=0.0004, sliding=0.1, density=300)
     for i in range(p.visible):
-        _add_domino(stage, p, f"domino_{i}", np.array([0.0, i * p.spacing]), 0.0, p.row_colour)
+        _add_domino(course, p, f"domino_{i}", np.array([0.0, i * p.spacing]), 0.0, p.row_colour)
     for i, side in enumerate(SIDES):
-        _add_branch(stage, p, side, float((-1, 1)[i] * angles[i]), junction)
-    stage.slab("post", (0, -h * (junction + BALL + 0.03), h * (PLANK + 0.3)), (0.03 * h, 0.03 * h, 0.3 * h), "grey")
+        _add_branch(course, p, side, float((-1, 1)[i] * angles[i]), junction)
+    course.slab("post", (0, -h * (junction + BALL + 0.03), h * (PLANK + 0.3)), (0.03 * h, 0.03 * h, 0.3 * h), "grey")
 
     back = -h * (junction - BALL - 0.2)
     for side in SIDES:  # either one ends a branch, fallen or not
-        stage.mark(f"{side} domino", f"end_{side}")
-    scene = stage.scene(
+        course.mark(f"{side} domino", f"end_{side}")
+    scene = course.scene(
         p,
         decisive=[f"end_{side}" for side in SIDES],
         hidden=[f"{side}_{p.gap_index}" for side in SIDES],
-        cover=stage.box((-h * left, h * (right + SHADOW_RIGHT)), (-h * front, back), (0, (PLANK + 1.04) * h)),
-        in_view=[stage.box((-h * left, h * right), (-h * front, h * 2.3), (0, h))],
+        cover=course.box((-h * left, h * (right + SHADOW_RIGHT)), (-h * front, back), (0, (PLANK + 1.04) * h)),
+        in_view=[course.box((-h * left, h * right), (-h * front, h * 2.3), (0, h))],
         things=[f"{p.left_colour} domino", f"{p.right_colour} domino", f"{p.ball_colour} ball", "board"],
         also=["post", "row", "branch"],
         colours=["grey"],
@@ -98,7 +98,7 @@ def build(p: Params, physics: Physics) -> Scene:
     return replace(scene, velocity={"starter": (0, -speed, 0, speed / (BALL * h), 0, 0)})
 
 
-def _add_branch(stage: Stage, p: Params, side: str, yaw: float, junction: float) -> None:
+def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: float) -> None:
     """The dominoes of a branch, one of which may lie beside it, on the inner side."""
     ahead, inwards = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
@@ -107,18 +107,18 @@ def _add_branch(stage: Stage, p: Params, side: str, yaw: float, junction: float)
         at, lying = start + i * p.spacing * ahead, i == p.gap_index and side == p.gap_side
         if lying:
             at = at + (p.width + 0.15) * inwards
-        _add_domino(stage, p, name, at, yaw, colour, lying=lying)
+        _add_domino(course, p, name, at, yaw, colour, lying=lying)
 
 
 def _add_domino(
-    stage: Stage, p: Params, name: str, at: np.ndarray, yaw: float, colour: str, *, lying: bool = False
+    course: Course, p: Params, name: str, at: np.ndarray, yaw: float, colour: str, *, lying: bool = False
 ) -> None:
     """A free domino (body and geom `name`) at (across, along), its thickness along a direction `yaw` from the row."""
     h = p.height_m
     deep, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
     place = (float(at[0]) * h, -float(at[1]) * h, (PLANK + high / 2) * h)
     half = (p.width * h / 2, deep * h / 2, high * h / 2)
-    body = stage.free_box(name, place, half, colour, density=500, sliding=0.2, solref=(0.006, 1))
+    body = course.free_box(name, place, half, colour, density=500, sliding=0.2, solref=(0.006, 1))
     body.quat = [float(np.cos(yaw / 2)), 0, 0, float(np.sin(yaw / 2))]
 
 

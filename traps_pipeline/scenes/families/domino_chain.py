@@ -12,15 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
+from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import has_begun, has_fallen, lies_flat
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
@@ -65,14 +65,14 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Both parts of the row on a plank, a ball before each, posts that stop the second ball."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     colours = [p.row_colour] * (p.concealed - 1) + [p.last_colour]
     second = [
         Standing(name, i, colour, aside=p.gap_open and i == p.gap_index)
         for i, (name, colour) in enumerate(zip(p.second, colours, strict=True))
     ]
     along = dominoes.add_rows(
-        stage,
+        course,
         p.size,
         first=[p.first_colour] + [p.row_colour] * (p.visible - 1),
         second=second,
@@ -82,13 +82,13 @@ def build(p: Params, physics: Physics) -> Scene:
         speed_m_s=p.starter_speed_m_s,
     )
     back = 1.5 * p.width + 0.20
-    stage.mark("domino", "last")
-    return stage.scene(
+    course.mark("domino", "last")
+    return course.scene(
         p,
         decisive=["last"],
         hidden=[p.second[p.gap_index]],
-        cover=dominoes.cover(stage, p.size, along, back),
-        in_view=[dominoes.in_view(stage, p.size, along, back)],
+        cover=dominoes.cover(course, p.size, along, back),
+        in_view=[dominoes.in_view(course, p.size, along, back)],
         things=[f"{p.first_colour} domino", f"{p.last_colour} domino", f"{p.ball_colour} ball", "plank"],
         also=["post"],
         colours=["grey"],

@@ -14,17 +14,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
+from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import around, upper_half_stays
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
-from traps_pipeline.scenes.vision import blobs, colour_mask, moved
-from traps_pipeline.scenes.wording import choices_in
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, moved
+from traps_pipeline.scenes.parts.wording import choices_in
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 Ranges = tuple[tuple[int, int], ...]  # the choices: least and most dominoes of each
 RANGES: tuple[Ranges, ...] = (((1, 2), (3, 4), (5, 6)), ((1, 2), (3, 5), (6, 7)))
@@ -80,10 +80,10 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Both rows on a plank, a ball before each, posts that stop the second ball."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     places = [i if i < p.gap_after else i + 1 for i in range(len(p.second))]
     along = dominoes.add_rows(
-        stage,
+        course,
         p.size,
         first=[p.first_colour] * p.visible,
         second=[Standing(name, place, p.second_colour) for name, place in zip(p.second, places, strict=True)],
@@ -95,13 +95,13 @@ def build(p: Params, physics: Physics) -> Scene:
     back = p.width / 2 + 0.65
     row = len(p.second) * p.size.spacing  # the gap may be anywhere in it
     middle = along[1] - p.height_m * (dominoes.RUN_OUT + row / 2)
-    stage.mark("domino", (middle, p.height_m * p.width / 2), p.second_colour)
-    return stage.scene(
+    course.mark("domino", (middle, p.height_m * p.width / 2), p.second_colour)
+    return course.scene(
         p,
         decisive=p.second,
         hidden=p.second,
-        cover=dominoes.cover(stage, p.size, along, back),
-        in_view=[dominoes.in_view(stage, p.size, along, back)],
+        cover=dominoes.cover(course, p.size, along, back),
+        in_view=[dominoes.in_view(course, p.size, along, back)],
         things=[f"{p.first_colour} domino", f"{p.second_colour} domino", f"{p.ball_colour} ball", "plank"],
         also=["post", "row"],
         colours=["grey"],

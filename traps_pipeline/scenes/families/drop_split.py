@@ -13,14 +13,14 @@ from math import atan2, hypot
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SOFT, Course, Surface, coloured
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import carried_on, rounded
-from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
-from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface, coloured
+from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask, largest, slanting_edges
+from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, slanting_edges
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 
 GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the bins' floors
@@ -67,41 +67,41 @@ def twins(p: Params) -> list[Params]:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Bins with a high back and a low front, the ridge of two boards that lean together, a cube to one side."""
-    stage = Stage(physics, surface=FELT)
+    course = Course(physics, surface=FELT)
     r, end, high = p.radius_m, p.bin_m, p.ridge_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
     bins = (("left", "red", (-end, 0), (-outer, -end)), ("right", "blue", (0, end), (end, outer)))
     for name, colour, floor, wall in bins:
-        stage.block(f"{name}_floor", floor, deep, (0, FLOOR_M), colour)
-        stage.block(f"{name}_end", wall, deep, (0, 0.24), colour)
-        stage.block(f"{name}_front", floor, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.4 * r), colour)
-    stage.block("back", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.back_colour)
+        course.block(f"{name}_floor", floor, deep, (0, FLOOR_M), colour)
+        course.block(f"{name}_end", wall, deep, (0, 0.24), colour)
+        course.block(f"{name}_front", floor, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.4 * r), colour)
+    course.block("back", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.back_colour)
     half_board = (hypot(p.foot_m, p.ridge_m) / 2, DEPTH_M, 0.01)
     for name, side in (("left", -1), ("right", 1)):
         middle = (p.offset_m + side * p.foot_m / 2, 0, FLOOR_M + p.ridge_m / 2 - 0.02)
         slope = side * atan2(p.ridge_m, p.foot_m)
-        FELT.on(stage.slab(f"ridge_{name}", middle, half_board, p.wedge_colour, falls_rad=slope))
+        FELT.on(course.slab(f"ridge_{name}", middle, half_board, p.wedge_colour, falls_rad=slope))
 
     beside = p.cube_side * (end + 0.20 + p.cube_m / 2 + (0.15 if p.cube_side > 0 else 0.0))
     half = p.cube_m / 2
-    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
     fall_s = (p.toss_m_s + (p.toss_m_s**2 + 2 * GRAVITY * (p.release_m - r - p.ridge_m)) ** 0.5) / GRAVITY
     start, throw = (-p.drift_m_s * fall_s, 0, p.release_m), (p.drift_m_s, p.toss_m_s)
-    stage.ball("ball", start, r, p.ball_colour, thrown=throw, rolling=0.0002).solref = list(SOFT)
+    course.ball("ball", start, r, p.ball_colour, thrown=throw, rolling=0.0002).solref = list(SOFT)
 
     front = -DEPTH_M - WALL_M
     things = (f"{p.ball_colour} ball", f"{p.cube_colour} cube", "red bin", "blue bin")
     for side in ("left", "right"):
-        stage.mark(f"{side} bin", f"{side}_floor")
-    stage.mark("ridge", (0.0, DEPTH_M), p.wedge_colour)
-    scene = stage.scene(
+        course.mark(f"{side} bin", f"{side}_floor")
+    course.mark("ridge", (0.0, DEPTH_M), p.wedge_colour)
+    scene = course.scene(
         p,
         decisive=["ball"],
         hidden=["ridge_left", "ridge_right"],
-        cover=stage.box((-outer, outer), (front, DEPTH_M + 0.10), (0, high + 0.02), right=0.04),
+        cover=course.box((-outer, outer), (front, DEPTH_M + 0.10), (0, high + 0.02), right=0.04),
         in_view=[
-            stage.box((-outer, outer), (front, DEPTH_M + WALL_M), (0, high)),
-            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((-outer, outer), (front, DEPTH_M + WALL_M), (0, high)),
+            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
         ],
         things=things,
         also=["ridge", "wall", "side"],

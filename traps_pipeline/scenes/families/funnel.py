@@ -13,14 +13,14 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rounded
-from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, shuffled, together
-from traps_pipeline.scenes.vision import at_rest, largest
+from traps_pipeline.scenes.parts.vision import at_rest, largest
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 FLOOR_M = 0.02  # thickness of the cup's floor
 WALL_M = 0.014
@@ -71,7 +71,7 @@ def twins(p: Params) -> list[Params]:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Shelf on two legs, cup, funnel before a back wall. Lengths run along the roll, from the middle of the funnel."""
-    stage = Stage(physics, p.direction, Surface(0.003, sliding=0.5, solref=SOFT))
+    course = Course(physics, p.direction, Surface(0.003, sliding=0.5, solref=SOFT))
     r, half, slope, deep = p.radius_m, p.cup_half_m, radians(p.slope_deg), (-DEPTH_M, DEPTH_M)
     mouth = p.throat_at_m + p.board_m * sin(slope)  # height of the funnel's upper edges
     narrow, wide = sorted((p.half_throat, p.other_half_throat))
@@ -79,11 +79,11 @@ def build(p: Params, physics: Physics) -> Scene:
     edge = -(rim - (wide - narrow) * r - 0.02)  # the shelf ends over the funnel's board, however narrow the throat
     start, top, under = edge - p.run_m, mouth + p.rise_m, mouth + p.rise_m - 0.03
 
-    stage.block("shelf", (start - r, edge), (-0.08, 0.08), (under, top), p.shelf_colour, Surface(2e-5, solref=SOFT))
+    course.block("shelf", (start - r, edge), (-0.08, 0.08), (under, top), p.shelf_colour, Surface(2e-5, solref=SOFT))
     for name, y in (("front", -0.07), ("back", 0.07)):
-        stage.block(f"leg_{name}", (start - r, start - r + 0.03), (y - 0.015, y + 0.015), (0, under), p.shelf_colour)
-    stage.ball("ball", (start, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
-    stage.tray(
+        course.block(f"leg_{name}", (start - r, start - r + 0.03), (y - 0.015, y + 0.015), (0, under), p.shelf_colour)
+    course.ball("ball", (start, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    course.tray(
         "cup",
         (-half, half),
         deep,
@@ -97,24 +97,24 @@ def build(p: Params, physics: Physics) -> Scene:
     )
     side, beyond = rim + 0.03, rim + 0.03 + 0.12  # shadows fall to the right: the wall is there to catch them
     wall = (-side, beyond) if p.direction > 0 else (-beyond, side)
-    stage.block("back", wall, (DEPTH_M, DEPTH_M + WALL_M), (0, mouth), p.back_colour)
+    course.block("back", wall, (DEPTH_M, DEPTH_M + WALL_M), (0, mouth), p.back_colour)
     for name, sign in (("near", -1), ("far", 1)):
         # The faces of the boards, not their middles, meet the throat's width.
         out = p.half_throat * r + p.board_m / 2 * cos(slope) + 0.008 * sin(slope)
         middle = (sign * out, 0, p.throat_at_m + p.board_m / 2 * sin(slope) - 0.008 * cos(slope))
         size = (p.board_m / 2, DEPTH_M - 0.005, 0.008)
-        board = stage.slab(f"board_{name}", middle, size, p.board_colour, falls_rad=-sign * slope)
+        board = course.slab(f"board_{name}", middle, size, p.board_colour, falls_rad=-sign * slope)
         Surface(0.002, sliding=0.4, solref=SOFT).on(board)
-    stage.mark("cup", "cup_floor")
-    stage.mark("funnel", (0.6 * rim, DEPTH_M), p.board_colour)
-    return stage.scene(
+    course.mark("cup", "cup_floor")
+    course.mark("funnel", (0.6 * rim, DEPTH_M), p.board_colour)
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["board_near", "board_far"],
-        cover=stage.box(wall, (-DEPTH_M, DEPTH_M + 0.08), (0, mouth + 0.03), right=0.05),
+        cover=course.box(wall, (-DEPTH_M, DEPTH_M + 0.08), (0, mouth + 0.03), right=0.05),
         in_view=[
-            stage.box(wall, (-DEPTH_M, DEPTH_M + WALL_M), (0, mouth)),
-            stage.box((start - r, edge), (-0.085, 0.085), (0, top)),
+            course.box(wall, (-DEPTH_M, DEPTH_M + WALL_M), (0, mouth)),
+            course.box((start - r, edge), (-0.085, 0.085), (0, top)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.cup_colour} cup", f"{p.shelf_colour} shelf", "funnel"],
         also=["board", "wall"],

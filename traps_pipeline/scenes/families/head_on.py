@@ -14,14 +14,14 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, colours_of_balls, end_of
-from traps_pipeline.scenes.parts.outcome import Reading, held_from, still_from, undecided
 from traps_pipeline.scenes.parts.questions import which_colour
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, held_from, still_from, undecided
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, several_between, shuffled
-from traps_pipeline.scenes.vision import is_panel, largest, track
+from traps_pipeline.scenes.parts.vision import is_panel, largest, track
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
 
 DECK_M = 0.035
 STEP_M = 0.018  # the ramps end this high over the deck
@@ -56,11 +56,11 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Two ramps, steps, and a deck with a centre line and low rims. The boards are alike but for their friction."""
-    stage = Stage(physics)
+    course = Course(physics)
     r, half, side, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
     deep, on_deck, board_at = (-side, side), (0, DECK_M), half - 0.10
     for i, name in enumerate(SIDES):
-        outwards = stage.towards((-1, 1)[i])
+        outwards = course.towards((-1, 1)[i])
         board = Surface(_roughness(p), priority=2) if outwards.direction == p.rough_side else FELT
         outwards.block(f"deck_{name}", (LINE_M, board_at - BOARD_M), deep, on_deck, p.deck_colour, FELT)
         outwards.block(f"board_{name}", (board_at - BOARD_M, board_at), deep, on_deck, "wood", board)
@@ -68,17 +68,17 @@ def build(p: Params, physics: Physics) -> Scene:
         _add_ramp(outwards, p, name, side)
         at = _on_ramp(p, p.ramp_m - p.starts_m[i], r)
         LIVELY.on(outwards.ball(f"ball_{name}", at, r, p.colours[i]))
-    stage.block("line", (-LINE_M, LINE_M), deep, on_deck, "black", FELT)
-    stage.sides("rim", (-half, half), side, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
+    course.block("line", (-LINE_M, LINE_M), deep, on_deck, "black", FELT)
+    course.sides("rim", (-half, half), side, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
 
     across = (-side - WALL_M - 0.02, side + WALL_M + 0.5 * high)
-    stage.mark("line", "line")
-    return stage.scene(
+    course.mark("line", "line")
+    return course.scene(
         p,
         decisive=[f"ball_{name}" for name in SIDES],
         hidden=[f"board_{name}" for name in SIDES],
-        cover=stage.box((-half + 0.01, half - 0.01), across, (0, high)),
-        in_view=[stage.box((-half - p.ramp_m, half + p.ramp_m), deep, (0, high))],
+        cover=course.box((-half + 0.01, half - 0.01), across, (0, high)),
+        in_view=[course.box((-half - p.ramp_m, half + p.ramp_m), deep, (0, high))],
         things=[*(f"{colour} ball" for colour in p.colours), *(f"{name} ramp" for name in SIDES)],
         also=["deck", "line", "board", "side"],
         colours=[*p.colours, "wood", "black"],
@@ -99,14 +99,14 @@ def _on_ramp(p: Params, along: float, over: float = 0.0) -> Vec3:
     return float(p.half_deck_m + along - over * np.sin(slope)), 0.0, float(high + over * np.cos(slope))
 
 
-def _add_ramp(stage: Stage, p: Params, name: str, side: float) -> None:
+def _add_ramp(course: Course, p: Params, name: str, side: float) -> None:
     """The ramp of one side, and the prop under its upper end."""
     slope, half_thick = float(np.radians(p.slope_deg)), 0.012
     half = (p.ramp_m / 2 / float(np.cos(slope)), side, half_thick)
-    stage.slab(f"ramp_{name}", _on_ramp(p, p.ramp_m / 2, -half_thick), half, p.ramp_colour, falls_rad=-slope)
+    course.slab(f"ramp_{name}", _on_ramp(p, p.ramp_m / 2, -half_thick), half, p.ramp_colour, falls_rad=-slope)
     foot, _, top = _on_ramp(p, p.ramp_m - 0.05)
     middle = top / 2 - 0.012
-    stage.slab(f"prop_{name}", (foot, 0, middle), (0.012, side, middle), p.ramp_colour)
+    course.slab(f"prop_{name}", (foot, 0, middle), (0.012, side, middle), p.ramp_colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import carried_on, small
-from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import yes_no
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import Blob, at_rest
+from traps_pipeline.scenes.parts.vision import Blob, at_rest
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 
 DECK_M = 0.03
 WALL_M = 0.012
@@ -57,33 +57,33 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A flat track with rails; of each lane the end is closed by which no ball enters."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, half, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
     end, switch_at, length = half + p.run_m, -half + p.switch_m, float(np.hypot(*SWITCH)) * r
     track, outer, up = (-end, end), (-side - WALL_M, side + WALL_M), (DECK_M, DECK_M + 1.1 * r)
 
-    stage.block("deck", track, (-side, side), (0, DECK_M), p.deck_colour)
-    stage.block("wall_front", track, (outer[0], -side), (0, DECK_M + 0.5 * r), p.rail_colour)
-    stage.block("wall_back", track, (side, outer[1]), (0, up[1]), p.rail_colour)
-    stage.block("rail_in", (-end, switch_at - 0.3 * r), (-0.004, 0.004), up, p.rail_colour)
-    stage.block("rail_out", (switch_at + length + 0.3 * r, end), (-0.004, 0.004), up, p.rail_colour)
+    course.block("deck", track, (-side, side), (0, DECK_M), p.deck_colour)
+    course.block("wall_front", track, (outer[0], -side), (0, DECK_M + 0.5 * r), p.rail_colour)
+    course.block("wall_back", track, (side, outer[1]), (0, up[1]), p.rail_colour)
+    course.block("rail_in", (-end, switch_at - 0.3 * r), (-0.004, 0.004), up, p.rail_colour)
+    course.block("rail_out", (switch_at + length + 0.3 * r, end), (-0.004, 0.004), up, p.rail_colour)
     for name, at, lane in (("stop_near", -half, p.lanes[0]), ("stop_far", half - 0.02, p.lanes[1])):
-        stage.block(name, (at, at + 0.02), (-side, 0) if lane > 0 else (0, side), up, p.rail_colour)
-    _add_switch(stage, p, switch_at, length)
+        course.block(name, (at, at + 0.02), (-side, 0) if lane > 0 else (0, side), up, p.rail_colour)
+    _add_switch(course, p, switch_at, length)
     for i, (start, speed) in enumerate(((1.5 * r - end, p.speeds_m_s[0]), (end - 1.5 * r, -p.speeds_m_s[1]))):
         at = (start, p.lanes[i] * HALF_PITCH * r, DECK_M + r)
-        stage.ball(f"ball_{i}", at, r, p.colours[i], speed=speed, rolling=0.001, sliding=0.5)
+        course.ball(f"ball_{i}", at, r, p.colours[i], speed=speed, rolling=0.001, sliding=0.5)
 
     high = DECK_M + 2 * r
     across = (outer[0] - 0.01, outer[1] + SHADOW_BACK * high)
     for i, colour in enumerate(p.colours):
-        stage.mark(f"{colour} ball", f"ball_{i}")
-    return stage.scene(
+        course.mark(f"{colour} ball", f"ball_{i}")
+    return course.scene(
         p,
         decisive=["ball_0", "ball_1"],
         hidden=["switch"],
-        cover=stage.box((-half - 0.01, half + 0.01), across, (0, high), right=SHADOW_RIGHT * high),
-        in_view=[stage.box(track, outer, (0, high))],
+        cover=course.box((-half - 0.01, half + 0.01), across, (0, high), right=SHADOW_RIGHT * high),
+        in_view=[course.box(track, outer, (0, high))],
         things=[*(f"{c} ball" for c in p.colours), "track", "front lane of the track", "back lane of the track"],
         also=["lane", "rail"],
         colours=p.colours,
@@ -91,13 +91,13 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_switch(stage: Stage, p: Params, at: float, length: float) -> None:
+def _add_switch(course: Course, p: Params, at: float, length: float) -> None:
     """The switch board: in line with the rails, or across the first ball's lane."""
     across, along = SWITCH[0] * p.radius_m, SWITCH[1] * p.radius_m
     x, y = (at + along / 2, p.lanes[0] * across / 2) if p.turned else (at + length / 2, 0.0)
     yaw = -p.direction * p.lanes[0] * float(np.arctan2(across, along)) if p.turned else 0.0
     high = 0.6 * p.radius_m
-    board = stage.slab("switch", (x, y, DECK_M + high), (length / 2, 0.006, high), p.switch_colour)
+    board = course.slab("switch", (x, y, DECK_M + high), (length / 2, 0.006, high), p.switch_colour)
     board.quat = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
     Surface(1e-4, sliding=0.05).on(board)
 

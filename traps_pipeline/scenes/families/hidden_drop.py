@@ -13,14 +13,14 @@ from math import radians
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import nearer_side
-from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, left_or_right
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import largest, slanting_edges
+from traps_pipeline.scenes.parts.vision import largest, slanting_edges
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 WALL_M = 0.012
 NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
@@ -58,7 +58,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
     Only track, post, chute and ball are mirrored by `direction`; bins and board are left and right in the picture.
     """
-    stage = Stage(physics)
+    course = Course(physics)
     r, d, half_y, half_x = p.radius_m, p.direction, 1.5 * p.radius_m, p.bin_m + WALL_M
     bore, top = 1.2 * r, p.chute_m + p.chute_height_m  # half the chute's inner width; its upper end
     track = top - 2.4 * r  # two ball diameters below that
@@ -69,43 +69,43 @@ def build(p: Params, physics: Physics) -> Scene:
 
     far = -p.start_m - 0.08
     run = along(far, -bore)
-    stage.block("track", run, (-1.1 * r, 1.1 * r), (under, track), p.chute_colour)
+    course.block("track", run, (-1.1 * r, 1.1 * r), (under, track), p.chute_colour)
     for side in (-1, 1):
         y = side * 1.1 * r
-        stage.block(f"rail_{side}", run, (y - 0.005, y + 0.005), (under, track + 0.35 * r), p.chute_colour)
-    stage.block("post", along(far + 0.02, far + 0.06), (-0.02, 0.02), (0, under), p.chute_colour)
+        course.block(f"rail_{side}", run, (y - 0.005, y + 0.005), (under, track + 0.35 * r), p.chute_colour)
+    course.block("post", along(far + 0.02, far + 0.06), (-0.02, 0.02), (0, under), p.chute_colour)
     for name, side, upper in (("far", d, top), ("near", -d, under)):
         x = side * (bore + WALL_M / 2)
-        stage.block(f"chute_{name}", (x - WALL_M / 2, x + WALL_M / 2), across, (p.chute_m, upper), p.chute_colour)
+        course.block(f"chute_{name}", (x - WALL_M / 2, x + WALL_M / 2), across, (p.chute_m, upper), p.chute_colour)
     for name, y in (("front", -half_y - WALL_M), ("back", half_y)):
         width = (-bore - WALL_M, bore + WALL_M)
-        stage.block(f"chute_{name}", width, (y, y + WALL_M), (p.chute_m, top), p.chute_colour)
+        course.block(f"chute_{name}", width, (y, y + WALL_M), (p.chute_m, top), p.chute_colour)
 
     plate = (0, 0, p.chute_m - 3.6 * r)
     tilt = p.tilt * radians(p.tilt_deg)
-    Surface(sliding=0.5).on(stage.slab("plate", plate, (2 * r, half_y, 0.008), p.plate_colour, falls_rad=tilt))
-    stage.block("partition", (-WALL_M / 2, WALL_M / 2), across, (0, plate[2] - 0.02), p.chute_colour)
+    Surface(sliding=0.5).on(course.slab("plate", plate, (2 * r, half_y, 0.008), p.plate_colour, falls_rad=tilt))
+    course.block("partition", (-WALL_M / 2, WALL_M / 2), across, (0, plate[2] - 0.02), p.chute_colour)
     bins = (
         ("left", p.left_colour, (-p.bin_m, 0), (-half_x, -p.bin_m), (-half_x, 0)),
         ("right", p.right_colour, (0, p.bin_m), (p.bin_m, half_x), (0, half_x)),
     )
     for name, colour, floor, end, whole in bins:
-        stage.block(f"bin_{name}", floor, across, (0, 0.015), colour, Surface(0.004))
-        stage.block(f"end_{name}", end, across, (0, p.rim_m), colour)
-        stage.block(f"front_{name}", whole, front, (0, 0.5 * r), colour)
+        course.block(f"bin_{name}", floor, across, (0, 0.015), colour, Surface(0.004))
+        course.block(f"end_{name}", end, across, (0, p.rim_m), colour)
+        course.block(f"front_{name}", whole, front, (0, 0.5 * r), colour)
     back, board = half_y + 2 * WALL_M, (-half_x - 0.02, half_x + SHADOW_RIGHT * p.chute_m)
-    stage.block("board", board, (half_y + WALL_M, back), (0, p.chute_m + 0.12), p.board_colour)
-    stage.ball("ball", (-d * p.start_m, 0, track + r), r, p.ball_colour, speed=d * p.speed_m_s)
+    course.block("board", board, (half_y + WALL_M, back), (0, p.chute_m + 0.12), p.board_colour)
+    course.ball("ball", (-d * p.start_m, 0, track + r), r, p.ball_colour, speed=d * p.speed_m_s)
 
-    covered = stage.box(board, (front[0], back), (0, p.chute_m + 0.02))
+    covered = course.box(board, (front[0], back), (0, p.chute_m + 0.02))
     for side in ("left", "right"):
-        stage.mark(f"{side} bin", f"bin_{side}")
-    return stage.scene(
+        course.mark(f"{side} bin", f"bin_{side}")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["plate"],
         cover=covered,
-        in_view=[covered, stage.box((-bore, bore), across, (p.chute_m, top))],
+        in_view=[covered, course.box((-bore, bore), across, (p.chute_m, top))],
         things=[f"{p.ball_colour} ball", "high track", "chute", "post"],
         also=["bin", "board", "plate"],
     )

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, Course, Surface, brake
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import colours_of_balls
-from traps_pipeline.scenes.parts.outcome import Reading, first_past
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, either, which_colour
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface, brake
+from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import (
     Drawn,
     apart,
@@ -28,7 +27,8 @@ from traps_pipeline.scenes.parts.vary import (
     several_between,
     shuffled,
 )
-from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 DECK_M = 0.045  # height of the lanes; the tray lies lower, so that no ball rolls back into the tunnel
 TRAY_M = 0.015
@@ -80,39 +80,39 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Deck with rails, opaque tunnel, sunken tray. Lengths run along the lanes."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
     deep, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
     rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the panel
     after = rough_at + ROUGH_BOARD_M
 
-    stage.block("deck_in", (-0.03, rough_at), deep, (0, DECK_M), p.deck_colour)
-    stage.block("deck_out", (after, p.exit_m), deep, (0, DECK_M), p.deck_colour)
+    course.block("deck_in", (-0.03, rough_at), deep, (0, DECK_M), p.deck_colour)
+    course.block("deck_out", (after, p.exit_m), deep, (0, DECK_M), p.deck_colour)
     for i in range(lanes + 1):
         y = -side + i * pitch
         across, up = (y - 0.004, y + 0.004), (DECK_M, DECK_M + 0.4 * r)
-        stage.block(f"rail_{i}", (-0.03, p.exit_m), across, up, p.tunnel_colour)
+        course.block(f"rail_{i}", (-0.03, p.exit_m), across, up, p.tunnel_colour)
     for i, ball in enumerate(p.balls):
         y = (i - (lanes - 1) / 2) * pitch
         board = Surface(2e-5 if i == p.clear_lane else _roughness(p, i, physics))
-        stage.block(f"board_{i}", (rough_at, after), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
-        stage.ball(ball, (p.starts_m[i], y, DECK_M + r), r, p.colours[i], speed=p.speeds_m_s[i])
-    stage.sides("tunnel", tunnel, side, wall, (0, roof), p.tunnel_colour)
-    stage.block("tunnel_roof", tunnel, outer, (roof, roof + wall), p.tunnel_colour)
+        course.block(f"board_{i}", (rough_at, after), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
+        course.ball(ball, (p.starts_m[i], y, DECK_M + r), r, p.colours[i], speed=p.speeds_m_s[i])
+    course.sides("tunnel", tunnel, side, wall, (0, roof), p.tunnel_colour)
+    course.block("tunnel_roof", tunnel, outer, (roof, roof + wall), p.tunnel_colour)
     felt = Surface(4e-4)  # the balls come to rest in view
-    stage.block("tray", (p.exit_m, end), deep, (0, TRAY_M), p.tray_colour, felt)
-    stage.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
-    stage.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
+    course.block("tray", (p.exit_m, end), deep, (0, TRAY_M), p.tray_colour, felt)
+    course.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
+    course.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
 
     covered, up = (p.run_m + p.mouth_m, end + wall), (0, roof + wall)
     across = (-side - wall - 0.02, side + wall + SHADOW_BACK * roof)
-    return stage.scene(
+    return course.scene(
         p,
         decisive=p.balls,
         hidden=[f"board_{i}" for i in range(lanes)],
-        cover=stage.box(covered, across, up, right=stage.ahead(SHADOW_RIGHT * roof)),
-        in_view=[stage.box(covered, outer, up)],
+        cover=course.box(covered, across, up, right=course.ahead(SHADOW_RIGHT * roof)),
+        in_view=[course.box(covered, outer, up)],
         things=[*(f"{colour} ball" for colour in p.colours), "tunnel", "tray"],
         also=["lane"],
         colours=p.colours,

@@ -13,13 +13,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import DEAD, Course, Point, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import beyond, will_clear
-from traps_pipeline.scenes.parts.outcome import Reading, crossed
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
-from traps_pipeline.scenes.parts.stage import DEAD, Point, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, crossed
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02
 BARRIER_HALF_M = 0.014
@@ -65,32 +65,32 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Ledge, slide, kicker, pit, barrier and tray before a board that catches the shadows."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, rim = p.radius_m, 1.6 * p.radius_m, 0.012
     (_, top), (lip, lip_z) = p.way[0], p.way[-1]
     barrier, end = lip + p.barrier_at_m, lip + p.barrier_at_m + p.tray_m
     near, far = barrier - BARRIER_HALF_M, barrier + BARRIER_HALF_M
     deep, high, cut = (-side, side), p.tall_barrier_m + 0.03, 0.55 * p.slide_m
 
-    stage.block("ledge", (-p.ledge_m, 0), deep, (0, top), p.slide_colour)
+    course.block("ledge", (-p.ledge_m, 0), deep, (0, top), p.slide_colour)
     for i, (a, b) in enumerate(pairwise(p.way)):
-        stage.plank(f"slide_{i}", a, b, side, p.kicker_colour)
-    stage.block("kicker", (lip - 0.05, lip), deep, (0, lip_z - 0.05), p.kicker_colour)
-    stage.block("pit", (lip, near), deep, (0, FLOOR_M), p.tray_colour, CATCH)
+        course.plank(f"slide_{i}", a, b, side, p.kicker_colour)
+    course.block("kicker", (lip - 0.05, lip), deep, (0, lip_z - 0.05), p.kicker_colour)
+    course.block("pit", (lip, near), deep, (0, FLOOR_M), p.tray_colour, CATCH)
     height = p.tall_barrier_m if p.tall else p.low_barrier_m
-    stage.block("barrier", (near, far), deep, (0, height), p.barrier_colour, CATCH)
-    stage.block("tray", (far, end), deep, (0, FLOOR_M), p.tray_colour, CATCH)
-    stage.block("end", (end, end + 0.02), (-side - rim, side), (0, 0.20), p.slide_colour, CATCH)
-    stage.block("front_rail", (lip, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.slide_colour)
-    stage.block("board", (cut, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
-    stage.ball("ball", (-p.ledge_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
-    stage.mark("barrier", "barrier")
-    return stage.scene(
+    course.block("barrier", (near, far), deep, (0, height), p.barrier_colour, CATCH)
+    course.block("tray", (far, end), deep, (0, FLOOR_M), p.tray_colour, CATCH)
+    course.block("end", (end, end + 0.02), (-side - rim, side), (0, 0.20), p.slide_colour, CATCH)
+    course.block("front_rail", (lip, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.slide_colour)
+    course.block("board", (cut, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
+    course.ball("ball", (-p.ledge_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    course.mark("barrier", "barrier")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["barrier"],
-        cover=stage.box((cut, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.03), right=0.02),
-        in_view=[stage.box((-p.ledge_m, end), deep, (0, high))],
+        cover=course.box((cut, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.03), right=0.02),
+        in_view=[course.box((-p.ledge_m, end), deep, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.barrier_colour} barrier", "slide", "tray", f"{p.kicker_colour} kicker"],
         also=["ramp", "board"],
         shown_by={"ramp": ["slide"]},

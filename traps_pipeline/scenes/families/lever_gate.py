@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, beyond
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box
 
 FLOOR_M = 0.03  # the lane behind the panel
 STEP_M = 0.02  # the visible lane lies higher by this
@@ -59,41 +59,41 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A lane with a step before a board that carries the lever and catches the shadows."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, rim, top, (pivot, pivot_z) = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + STEP_M, p.pivot_m
     end = p.gate_at_m + 2 * p.arm_m + p.tail_m
     high = pivot_z + p.arm_m * float(np.sin(np.radians(p.swing_deg))) + 0.06
     deep, front = (-side, side), (-side - rim, -side)
 
-    stage.block("lane_in", (-p.run_m, STEP_AT_M), deep, (0, top), p.lane_colour)
+    course.block("lane_in", (-p.run_m, STEP_AT_M), deep, (0, top), p.lane_colour)
     felt = Surface(1e-3)  # the ball comes to rest on it
-    stage.block("lane", (STEP_AT_M, end), deep, (0, FLOOR_M), p.lane_colour, felt)
-    stage.block("front_in", (-p.run_m, STEP_AT_M), front, (0, top + 0.3 * r), p.board_colour)
-    stage.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + 0.3 * r), p.board_colour)
-    stage.block("front", (STEP_AT_M, end), front, (0, FLOOR_M + 0.3 * r), p.board_colour)
-    stage.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 1.6 * r), p.board_colour)
-    stage.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
+    course.block("lane", (STEP_AT_M, end), deep, (0, FLOOR_M), p.lane_colour, felt)
+    course.block("front_in", (-p.run_m, STEP_AT_M), front, (0, top + 0.3 * r), p.board_colour)
+    course.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + 0.3 * r), p.board_colour)
+    course.block("front", (STEP_AT_M, end), front, (0, FLOOR_M + 0.3 * r), p.board_colour)
+    course.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 1.6 * r), p.board_colour)
+    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
     axle = (pivot - 0.012, pivot + 0.012), (-0.03, side), (pivot_z - 0.012, pivot_z + 0.012)
-    stage.block("axle", *axle, "grey", solid=False)
-    _add_lever(stage, p, side)
-    stage.ball("ball", (-p.run_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
-    stage.mark("gate", (p.gate_at_m, side), p.gate_colour)  # below its place on the lever, open or shut
-    return stage.scene(
+    course.block("axle", *axle, "grey", solid=False)
+    _add_lever(course, p, side)
+    course.ball("ball", (-p.run_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    course.mark("gate", (p.gate_at_m, side), p.gate_colour)  # below its place on the lever, open or shut
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["counterweight", "beam", "gate"],
-        cover=stage.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
-        in_view=[stage.box((-p.run_m, end), deep, (0, high))],
+        cover=course.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
+        in_view=[course.box((-p.run_m, end), deep, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.gate_colour} gate", f"{p.lever_colour} lever", "counterweight"],
         also=["lane", "board"],
     )
 
 
-def _add_lever(stage: Stage, p: Params, side: float) -> None:
+def _add_lever(course: Course, p: Params, side: float) -> None:
     """The lever with gate and counterweight, at rest where the counterweight holds it."""
     start, d = p.swing_deg if p.held_open else 0.0, p.direction
     low, high = sorted((d * -start, d * (p.swing_deg - start)))
-    body = stage.hinge("lever", (p.pivot_m[0], 0, p.pivot_m[1]), damping=0.05, range_deg=(low, high))
+    body = course.hinge("lever", (p.pivot_m[0], 0, p.pivot_m[1]), damping=0.05, range_deg=(low, high))
     half = d * float(np.radians(start)) / 2
     body.quat = [float(np.cos(half)), 0.0, float(np.sin(half)), 0.0]
     add_box(body, "beam", (0, 0, 0), (p.arm_m + 0.015, 0.022, 0.011), p.lever_colour, density=200)

@@ -16,7 +16,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import (
+from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball, turned
+from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, choice_of, either
+from traps_pipeline.scenes.parts.readings import Reading
+from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
+from traps_pipeline.scenes.parts.vision import Blob, colour_mask
+from traps_pipeline.scenes.physics.kit import (
     Inventory,
     Motion,
     Physics,
@@ -27,12 +33,6 @@ from traps_pipeline.scenes.kit import (
     listed,
     uniform,
 )
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball, turned
-from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.outcome import Reading
-from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, choice_of, either
-from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
-from traps_pipeline.scenes.vision import Blob, colour_mask
 
 SILL_M = 0.03  # below the zones
 ZONE_M = 0.19  # length of the walls between the zones
@@ -173,7 +173,7 @@ def build(p: Params, physics: Physics) -> Scene:
         spec=board.spec,
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=tuple(f"ball_{i}" for i in range(BALLS)),
-        stage=board.ends(top),
+        framed=board.ends(top),
         rest=board.region((0, p.rim_m), board.deep),
         inventory=Inventory(tuple(colours), ("ball", "board", "peg", "zone", "shelf", "wall")),
     )

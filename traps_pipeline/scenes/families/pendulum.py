@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, rgba
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
-from traps_pipeline.scenes.parts.outcome import Reading, top_m, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import largest, track
+from traps_pipeline.scenes.parts.vision import largest, track
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, rgba
 
 FLOOR_M = 0.02  # what the block stands on
 STEP_M = 0.02  # the visible lane lies higher by this
@@ -77,35 +77,35 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A raised lane, then floor and block before a board that carries pendulum and peg."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
     deep, top = (-side, side), FLOOR_M + p.lane_m
     end = p.block_at_m + p.block_height_m + 0.14  # the fallen block has room before it
     lip = p.pivot_at_m - 2 * r + 0.80 * r  # the ball touches it a little after it has touched the bob
 
-    stage.block("lane_in", (-p.run_m, STEP_AT_M), deep, (0, top + STEP_M), p.lane_colour)
-    stage.block("lane", (STEP_AT_M, lip + 0.008), deep, (0, top), p.lane_colour, Surface(3e-4))
-    stage.block("lip", (lip, lip + 0.008), deep, (top, top + 0.25 * r), p.board_colour)
-    stage.block("front_in", (-p.run_m, STEP_AT_M), (-side - rim, -side), (0, top + STEP_M + 0.3 * r), p.board_colour)
-    stage.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
-    stage.block("front", (STEP_AT_M, lip + 0.008), (-side - rim, -side), (0, top + 0.3 * r), p.board_colour)
-    stage.block("floor_board", (lip + 0.008, end), (-side - rim, side), (0, FLOOR_M), p.lane_colour)
-    stage.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 0.06), p.board_colour)
-    stage.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
-    _add_pendulum(stage, p, side)
+    course.block("lane_in", (-p.run_m, STEP_AT_M), deep, (0, top + STEP_M), p.lane_colour)
+    course.block("lane", (STEP_AT_M, lip + 0.008), deep, (0, top), p.lane_colour, Surface(3e-4))
+    course.block("lip", (lip, lip + 0.008), deep, (top, top + 0.25 * r), p.board_colour)
+    course.block("front_in", (-p.run_m, STEP_AT_M), (-side - rim, -side), (0, top + STEP_M + 0.3 * r), p.board_colour)
+    course.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
+    course.block("front", (STEP_AT_M, lip + 0.008), (-side - rim, -side), (0, top + 0.3 * r), p.board_colour)
+    course.block("floor_board", (lip + 0.008, end), (-side - rim, side), (0, FLOOR_M), p.lane_colour)
+    course.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 0.06), p.board_colour)
+    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
+    _add_pendulum(course, p, side)
     peg_z = p.pivot_z_m - PEG_DOWN * p.length_m
-    stage.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, side, peg_z), PEG_RADIUS_M, "yellow")
+    course.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, side, peg_z), PEG_RADIUS_M, "yellow")
     half = (p.block_half_m, 0.6 * side, p.block_height_m / 2)
-    stage.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half, p.block_colour, density=400)
-    stage.ball("ball", (-p.run_m + 1.2 * r, 0, top + STEP_M + r), r, p.ball_colour, speed=p.speed_m_s)
-    stage.mark("bob", (p.pivot_at_m, side), p.bob_colour)
-    stage.mark("block", "block")
-    return stage.scene(
+    course.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half, p.block_colour, density=400)
+    course.ball("ball", (-p.run_m + 1.2 * r, 0, top + STEP_M + r), r, p.ball_colour, speed=p.speed_m_s)
+    course.mark("bob", (p.pivot_at_m, side), p.bob_colour)
+    course.mark("block", "block")
+    return course.scene(
         p,
         decisive=["block"],
         hidden=["peg"],
-        cover=stage.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
-        in_view=[stage.box((-p.run_m, end), deep, (0, high))],
+        cover=course.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
+        in_view=[course.box((-p.run_m, end), deep, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.bob_colour} pendulum bob", "pendulum"],
         also=["lane", "board", "peg", "rod"],
         colours=["black", "yellow"],
@@ -113,17 +113,17 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_pendulum(stage: Stage, p: Params, side: float) -> None:
+def _add_pendulum(course: Course, p: Params, side: float) -> None:
     """A bob on a rod that hangs from an axle in the board and swings along the way."""
     import mujoco
 
-    body = stage.hinge("pendulum", (p.pivot_at_m, 0, p.pivot_z_m), damping=0.02)
-    stage.rod("rod", (0, 0, 0), (0, 0, -p.length_m), ROD_RADIUS_M, "black", body=body).density = 300
+    body = course.hinge("pendulum", (p.pivot_at_m, 0, p.pivot_z_m), damping=0.02)
+    course.rod("rod", (0, 0, 0), (0, 0, -p.length_m), ROD_RADIUS_M, "black", body=body).density = 300
     bob = body.add_geom(name="bob", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0, -p.length_m])
     bob.size, bob.rgba = [p.radius_m, 0, 0], rgba(p.bob_colour)
     bob.priority, bob.solref, bob.friction = 2, [-60000, -25], [0.1, 0.005, 0.0001]  # takes over the ball's speed
     pivot = (p.pivot_at_m, -0.015, p.pivot_z_m)
-    stage.rod("axle", pivot, (p.pivot_at_m, side, p.pivot_z_m), 0.014, "black", solid=False)
+    course.rod("axle", pivot, (p.pivot_at_m, side, p.pivot_z_m), 0.014, "black", solid=False)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

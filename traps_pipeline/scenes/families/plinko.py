@@ -14,13 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Inventory, Motion, Physics, Scene, View, distinct_colours, listed, uniform
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, colour_from, either
+from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
-from traps_pipeline.scenes.wording import choices_in
+from traps_pipeline.scenes.parts.wording import choices_in
+from traps_pipeline.scenes.physics.kit import Inventory, Motion, Physics, Scene, View, distinct_colours, listed, uniform
 
 APRON_M = 0.175  # strip below the buckets that carries their numbers
 BUCKET_M = 0.16  # length of the walls between the buckets
@@ -126,7 +126,7 @@ def build(p: Params, physics: Physics) -> Scene:
         spec=board.spec,
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=("ball_0",),
-        stage=board.ends(top),
+        framed=board.ends(top),
         rest=board.region((APRON_M, p.rim_m), board.deep),
         velocity={f"ball_{i}": board.throw(push, rise) for i, (push, rise) in enumerate(throws)},
         inventory=Inventory(tuple(colours), ("ball", "board", "peg", "bucket", "number", "wall")),

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, compact, nearer_side
-from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, left_or_right, material_of
 from traps_pipeline.scenes.parts.ramp import Ramp
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import between, hidden, in_front, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 BOARD_M = 0.016  # thickness of the ramp
 WALL_M = 0.012
@@ -51,42 +51,42 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Table with a front and a back wall, deflector, a bin at either side, ramp behind."""
-    stage = Stage(physics)
+    course = Course(physics)
     r, top, wide, rim, side = p.radius_m, p.table_m, p.half_width_m, p.table_m + 1.1 * p.radius_m, 1.5 * p.radius_m
 
-    stage.block("table", (-wide, wide), (0, p.depth_m), (0, top), p.table_colour)
-    front = stage.block("wall_front", (-wide, wide), (-WALL_M, 0), (0, rim), p.table_colour)
+    course.block("table", (-wide, wide), (0, p.depth_m), (0, top), p.table_colour)
+    front = course.block("wall_front", (-wide, wide), (-WALL_M, 0), (0, rim), p.table_colour)
     for name, x in (("left", (-wide, p.ramp_x_m - side)), ("right", (p.ramp_x_m + side, wide))):
-        stage.block(f"wall_{name}", x, (p.depth_m, p.depth_m + WALL_M), (0, rim), p.table_colour)
+        course.block(f"wall_{name}", x, (p.depth_m, p.depth_m + WALL_M), (0, rim), p.table_colour)
     turn = np.radians(90 + p.angle_deg if p.deflects == "left" else 90 - p.angle_deg) / 2
     centre = (p.ramp_x_m, p.deflector_m * float(np.cos(np.radians(p.angle_deg))) + 0.02, top + 0.9 * r)
-    deflector = stage.slab("deflector", centre, (p.deflector_m, 0.008, 0.9 * r), p.deflector_colour)
+    deflector = course.slab("deflector", centre, (p.deflector_m, 0.008, 0.9 * r), p.deflector_colour)
     deflector.quat = [float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn))]
     for geom in (deflector, front):
         geom.friction, geom.priority, geom.condim = [0.02, 0.001, 0.0001], 1, 3
-    _add_bin(stage, p, "left", -1, "red")
-    _add_bin(stage, p, "right", 1, "blue")
+    _add_bin(course, p, "left", -1, "red")
+    _add_bin(course, p, "right", 1, "blue")
 
     ramp = Ramp(p.slope_deg, top, p.depth_m, towards_camera=True, middle_m=p.ramp_x_m)
     middle = p.ramp_m / 2
-    ramp.board(stage, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
+    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
     for name, x in (("left", -side), ("right", side)):
-        ramp.board(stage, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=x)
-    ramp.support(stage, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.ramp_colour)
-    stage.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
+        ramp.board(course, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=x)
+    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.ramp_colour)
+    course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
 
     high, out = top + 2 * r + 0.01, wide + p.bin_m + WALL_M
     _, back, highest = ramp.at(p.ramp_m)
     for name in ("left", "right"):
-        stage.mark(f"{name} bin", f"bin_{name}")
-    return stage.scene(
+        course.mark(f"{name} bin", f"bin_{name}")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["deflector"],
-        cover=stage.box((-out, out), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
+        cover=course.box((-out, out), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
         in_view=[
-            stage.box((-out, out), (-WALL_M, p.depth_m), (0, high)),
-            stage.box((p.ramp_x_m - side, p.ramp_x_m + side), (back, back), (0, highest)),
+            course.box((-out, out), (-WALL_M, p.depth_m), (0, high)),
+            course.box((p.ramp_x_m - side, p.ramp_x_m + side), (back, back), (0, highest)),
         ],
         things=[f"{p.ball_colour} ball", "red bin", "blue bin", "ramp", "table"],
         also=["board", "wall"],
@@ -94,16 +94,16 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_bin(stage: Stage, p: Params, name: str, sign: int, colour: str) -> None:
+def _add_bin(course: Course, p: Params, name: str, sign: int, colour: str) -> None:
     """An open box beside the table (sign -1: on the left), lower than it."""
     near, far = p.half_width_m, p.half_width_m + p.bin_m
     middle, half, depth = sign * (near + far) / 2, p.bin_m / 2, p.depth_m / 2
-    stage.slab(f"bin_{name}", (middle, depth, 0.006), (half, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
+    course.slab(f"bin_{name}", (middle, depth, 0.006), (half, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
     for end, y, high in (("front", -WALL_M / 2, 0.04), ("back", p.depth_m + WALL_M / 2, p.table_m)):
-        stage.slab(f"bin_{name}_{end}", (middle, y, high / 2), (half, WALL_M / 2, high / 2), colour)
+        course.slab(f"bin_{name}_{end}", (middle, y, high / 2), (half, WALL_M / 2, high / 2), colour)
     high = p.table_m + p.radius_m
     at = (sign * (far + WALL_M / 2), depth, high / 2)
-    stage.slab(f"bin_{name}_end", at, (WALL_M / 2, depth + WALL_M, high / 2), colour)
+    course.slab(f"bin_{name}_end", at, (WALL_M / 2, depth + WALL_M, high / 2), colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, rests_over
-from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, material_of, yes_no
 from traps_pipeline.scenes.parts.ramp import Ramp
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage
+from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 BOARD_M = 0.016  # thickness of ramp and board
 WALL_M = 0.012
@@ -61,38 +61,38 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Ramp with rails and support, deck in two parts with the gap between them, box."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, gap, end = p.radius_m, 1.7 * p.radius_m, p.gap_span, p.deck_end_m + p.box_m
     deep, deck, box = (-side, side), (0, p.deck_m), (p.deck_end_m, end)
     ramp, middle = Ramp(p.slope_deg, p.deck_m), p.ramp_m / 2
 
-    ramp.board(stage, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
+    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
     for name, y in (("front", -side), ("back", side)):
-        ramp.board(stage, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=y)
-    ramp.support(stage, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.deck_colour)
-    stage.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
-    stage.block("deck_in", (-0.01, gap[0]), deep, deck, p.deck_colour)
-    stage.block("deck_out", (gap[1], p.deck_end_m), deep, deck, p.deck_colour)
+        ramp.board(course, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=y)
+    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.deck_colour)
+    course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
+    course.block("deck_in", (-0.01, gap[0]), deep, deck, p.deck_colour)
+    course.block("deck_out", (gap[1], p.deck_end_m), deep, deck, p.deck_colour)
     top = BOARD_M if p.gap_open else p.deck_m
-    stage.block("board", gap, deep, (top - BOARD_M, top), p.deck_colour).friction = [0.8, 0.005, 0.002]
+    course.block("board", gap, deep, (top - BOARD_M, top), p.deck_colour).friction = [0.8, 0.005, 0.002]
     for name, y in (("front", -side), ("back", side)):
-        stage.block(f"pit_{name}", gap, (y - 0.005, y + 0.005), (0, 0.022), p.deck_colour)
-    stage.block("box_floor", box, deep, (0, WALL_M), p.box_colour).friction = [0.8, 0.005, 0.004]
-    stage.block("box_front", box, (-side - WALL_M, -side), (0, 0.035), p.box_colour)
-    stage.block("box_back", box, (side, side + WALL_M), (0, 0.09), p.box_colour)
+        course.block(f"pit_{name}", gap, (y - 0.005, y + 0.005), (0, 0.022), p.deck_colour)
+    course.block("box_floor", box, deep, (0, WALL_M), p.box_colour).friction = [0.8, 0.005, 0.004]
+    course.block("box_front", box, (-side - WALL_M, -side), (0, 0.035), p.box_colour)
+    course.block("box_back", box, (side, side + WALL_M), (0, 0.09), p.box_colour)
     outer = (-side - WALL_M, side + WALL_M)
-    stage.block("box_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.03), p.box_colour)
+    course.block("box_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.03), p.box_colour)
 
     high, covered = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.ramp_m)
-    stage.mark("box", "box_floor")
-    return stage.scene(
+    course.mark("box", "box_floor")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["board"],
-        cover=stage.box(covered, across, (0, high), right=stage.ahead(SHADOW_RIGHT * high)),
-        in_view=[stage.box(covered, outer, deck), stage.box((highest[0], 0), deep, (0, highest[2]))],
+        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(covered, outer, deck), course.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.ball_colour} ball", f"{p.box_colour} box", "ramp", "deck"],
         also=["end"],
         shown_by={"end": ["box"]},

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
+from traps_pipeline.scenes.parts.course import Course, brake
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import colours_of_balls, compact
-from traps_pipeline.scenes.parts.outcome import Reading, first_past
 from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.ramp import Ramp
-from traps_pipeline.scenes.parts.stage import Stage, brake
+from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
-from traps_pipeline.scenes.vision import Blob, at_rest
+from traps_pipeline.scenes.parts.vision import Blob, at_rest
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
 
 BOARD_M = 0.016  # thickness of a ramp
 WALL_M = 0.012
@@ -75,7 +75,7 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Two tracks that run to the front, each behind a ramp of its own, and one tray before both."""
-    stage = Stage(physics)
+    course = Course(physics)
     r, side, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
     rough = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
     foot = rough[1] + p.lead_m
@@ -84,38 +84,38 @@ def build(p: Params, physics: Physics) -> Scene:
     ramps = [Ramp(p.slope_deg, p.track_m, foot, towards_camera=True, middle_m=x) for x in tracks]
     for i, (x, ramp) in enumerate(zip(tracks, ramps, strict=True)):
         across, colour = (x - side, x + side), p.track_colours[i]
-        stage.block(f"track_out_{i}", across, (p.tray_m, rough[0]), track, colour)
+        course.block(f"track_out_{i}", across, (p.tray_m, rough[0]), track, colour)
         mat, rolling = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
-        stage.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling]
-        stage.block(f"track_in_{i}", across, (rough[1], foot + 0.01), track, colour)
+        course.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling]
+        course.block(f"track_in_{i}", across, (rough[1], foot + 0.01), track, colour)
         for k in (-1, 1):
             rail = (x + k * side - 0.004, x + k * side + 0.004)
-            stage.block(f"rail_{i}_{k}", rail, (p.tray_m, foot), (0, p.track_m + 0.01), colour)
-        ramp.board(stage, f"ramp_{i}", half_up, -BOARD_M / 2, (half_up, side, BOARD_M / 2), colour)
+            course.block(f"rail_{i}_{k}", rail, (p.tray_m, foot), (0, p.track_m + 0.01), colour)
+        ramp.board(course, f"ramp_{i}", half_up, -BOARD_M / 2, (half_up, side, BOARD_M / 2), colour)
         for k in (-1, 1):
-            ramp.board(stage, f"ramp_rail_{i}_{k}", half_up, 0, (half_up, 0.005, 0.4 * r), colour, aside=k * side)
-        ramp.support(stage, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * side, colour)
-        stage.ball(BALLS[i], ramp.at(p.starts_m[i], r), r, p.colours[i])
+            ramp.board(course, f"ramp_rail_{i}_{k}", half_up, 0, (half_up, 0.005, 0.4 * r), colour, aside=k * side)
+        ramp.support(course, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * side, colour)
+        course.ball(BALLS[i], ramp.at(p.starts_m[i], r), r, p.colours[i])
 
     half = p.apart_m / 2 + side + 0.02
     outer, deep, rim = (-half - WALL_M, half + WALL_M), (0, p.tray_m), (0, p.track_m + 0.01)
-    stage.block("tray_floor", (-half, half), deep, (0, WALL_M), p.tray_colour).friction = [0.8, 0.005, 0.006]
-    stage.block("tray_front", outer, (-WALL_M, 0), (0, 1.1 * r), p.tray_colour)
-    stage.block("tray_side_-1", (outer[0], -half), deep, rim, p.tray_colour)
-    stage.block("tray_side_1", (half, outer[1]), deep, rim, p.tray_colour)
-    stage.block("divider", (-0.006, 0.006), deep, (0, 0.9 * r), p.tray_colour)
+    course.block("tray_floor", (-half, half), deep, (0, WALL_M), p.tray_colour).friction = [0.8, 0.005, 0.006]
+    course.block("tray_front", outer, (-WALL_M, 0), (0, 1.1 * r), p.tray_colour)
+    course.block("tray_side_-1", (outer[0], -half), deep, rim, p.tray_colour)
+    course.block("tray_side_1", (half, outer[1]), deep, rim, p.tray_colour)
+    course.block("divider", (-0.006, 0.006), deep, (0, 0.9 * r), p.tray_colour)
 
     hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the panel with its shadow
     high = p.track_m + 2 * r + 0.015
     _, back, top = ramps[0].at(p.ramp_m)
     beside = half if p.azimuth_deg < 94 else -half  # where no ball rolls behind the flag
-    stage.mark("tray", (beside, p.tray_m), p.tray_colour)
-    return stage.scene(
+    course.mark("tray", (beside, p.tray_m), p.tray_colour)
+    return course.scene(
         p,
         decisive=BALLS,
         hidden=["board_0", "board_1"],
-        cover=stage.box(outer, (-WALL_M - 0.01, hidden_y), (0, high), right=0.02),
-        in_view=[stage.box(outer, (-WALL_M, foot), (0, high)), stage.box(outer, (back, back), (0, top))],
+        cover=course.box(outer, (-WALL_M - 0.01, hidden_y), (0, high), right=0.02),
+        in_view=[course.box(outer, (-WALL_M, foot), (0, high)), course.box(outer, (back, back), (0, top))],
         things=[*(f"{colour} ball" for colour in p.colours), "left ramp", "right ramp", "tray"],
         also=["track", "foot"],
         shown_by={"foot": ["tray"]},

@@ -13,14 +13,14 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, brake
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, compact, end_of
-from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Stage, brake
+from traps_pipeline.scenes.parts.readings import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import colour_mask
+from traps_pipeline.scenes.parts.vision import colour_mask
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 TRACK_M = 0.04  # height of the track
 WALL_M = 0.014
@@ -64,32 +64,32 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Track with kerbs, patch, two lines and end wall."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, side, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
     deep, outer, track = (-side, side), (-side - WALL_M, side + WALL_M), (0, TRACK_M)
     patch = (p.run_m + p.lead_m, p.run_m + p.lead_m + p.patch_m)
     rolling = brake(r, p.speed_m_s**2, p.stop_share * p.patch_m, physics) if p.rough else 2e-5
 
-    stage.block("track_in", (-0.02, patch[0]), deep, track, p.track_colour)
-    mat = stage.block("patch", patch, deep, track, "black" if p.rough else p.track_colour)
+    course.block("track_in", (-0.02, patch[0]), deep, track, p.track_colour)
+    mat = course.block("patch", patch, deep, track, "black" if p.rough else p.track_colour)
     mat.friction = [4.0, 0.005, rolling]
-    stage.block("track_out", (patch[1], p.line_m), deep, track, p.track_colour)
-    stage.block("felt", (p.line_m, end), deep, track, p.track_colour).friction = [0.8, 0.005, 0.006]
+    course.block("track_out", (patch[1], p.line_m), deep, track, p.track_colour)
+    course.block("felt", (p.line_m, end), deep, track, p.track_colour).friction = [0.8, 0.005, 0.006]
     for name, middle, colour in (("start_line", 0.6 * p.run_m, p.start_colour), ("line", p.line_m, p.line_colour)):
         painted = (middle - LINE_M / 2, middle + LINE_M / 2)
-        stage.block(name, painted, deep, (0, TRACK_M + 0.001), colour, solid=False)
-    stage.sides("kerb", (-0.02, end), side, WALL_M, (0, TRACK_M + 0.012), p.wall_colour)
-    stage.block("end_wall", (end, end + WALL_M), outer, (0, TRACK_M + 2 * r), p.wall_colour)
-    stage.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
+        course.block(name, painted, deep, (0, TRACK_M + 0.001), colour, solid=False)
+    course.sides("kerb", (-0.02, end), side, WALL_M, (0, TRACK_M + 0.012), p.wall_colour)
+    course.block("end_wall", (end, end + WALL_M), outer, (0, TRACK_M + 2 * r), p.wall_colour)
+    course.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
 
     high, covered, across = TRACK_M + 2 * r + 0.01, (p.run_m, end + WALL_M), (outer[0] - 0.01, outer[1] + 0.03)
-    stage.mark("line", "line")
-    return stage.scene(
+    course.mark("line", "line")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["patch"],
-        cover=stage.box(covered, across, (0, high), right=stage.ahead(SHADOW_RIGHT * high)),
-        in_view=[stage.box(covered, outer, (0, high)), stage.box((-0.02, 0.02), outer, track)],
+        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(covered, outer, (0, high)), course.box((-0.02, 0.02), outer, track)],
         things=[f"{p.ball_colour} ball", f"{p.line_colour} line", f"{p.start_colour} line", "track"],
         also=["wall", "kerb", "end"],
     )

@@ -17,15 +17,26 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Box, Inventory, Motion, Physics, Scene, View, add_box, listed, rgba, uniform
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, turned
+from traps_pipeline.scenes.parts.course import Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
-from traps_pipeline.scenes.parts.outcome import Reading, turns_deg
 from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
-from traps_pipeline.scenes.parts.stage import Surface
+from traps_pipeline.scenes.parts.readings import Reading, turns_deg
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, several_between, shuffled
-from traps_pipeline.scenes.vision import Blob, blobs, colour_mask, largest
+from traps_pipeline.scenes.parts.vision import Blob, blobs, colour_mask, largest
+from traps_pipeline.scenes.physics.kit import (
+    Box,
+    Inventory,
+    Motion,
+    Physics,
+    Scene,
+    View,
+    add_box,
+    listed,
+    rgba,
+    uniform,
+)
 
 SILL_M = 0.03  # below the bins
 BIN_M = 0.15  # length of the walls between the bins
@@ -198,7 +209,7 @@ def build(p: Params, physics: Physics) -> Scene:
         spec=board.spec,
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=("ball",),
-        stage=(sill, head, beside),
+        framed=(sill, head, beside),
         rest=board.region((SILL_M, p.rim_m), board.deep),
         velocity={"ball": board.throw(p.push_m_s, p.rise_m)},
         inventory=Inventory(tuple(colours), (*nouns, *(["box", "crate"] if p.crates_m else []))),

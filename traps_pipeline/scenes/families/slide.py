@@ -12,14 +12,14 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, compact, rests_over
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, material_of, yes_no
 from traps_pipeline.scenes.parts.ramp import Ramp
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage
+from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 INCLINE_M = 0.02  # thickness of the incline
 OVERLAP_M = 0.05  # the incline ends inside the deck, so that no edge catches the block
@@ -78,51 +78,51 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Deck, incline with its support and the block on it, the board in the deck, tray."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     side, far, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
     deep, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
 
-    deck = stage.block("deck", (-OVERLAP_M, far), deep, (0, p.deck_m), p.deck_colour)
+    deck = course.block("deck", (-OVERLAP_M, far), deep, (0, p.deck_m), p.deck_colour)
     ramp = Ramp(p.slope_deg, p.deck_m)
     half = ((p.incline_m + OVERLAP_M / 2) / 2, side, INCLINE_M / 2)
     middle = (p.incline_m - OVERLAP_M / 2) / 2
-    incline = ramp.board(stage, "incline", middle, -INCLINE_M / 2, half, p.incline_colour)
+    incline = ramp.board(course, "incline", middle, -INCLINE_M / 2, half, p.incline_colour)
     for geom in (deck, incline):
         geom.friction, geom.priority = [p.deck_friction, 0.001, 0.0001], 1
-    ramp.support(stage, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * side, p.deck_colour)
+    ramp.support(course, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * side, p.deck_colour)
     start = ramp.at(p.incline_m - p.start_m, p.block_half_m[2])
-    block = stage.free_box("block", start, p.block_half_m, p.block_colour, density=600)
+    block = course.free_box("block", start, p.block_half_m, p.block_colour, density=600)
     turn = ramp.slope_rad / 2
     block.quat = [float(np.cos(turn)), 0.0, p.direction * float(np.sin(turn)), 0.0]
-    _add_board(stage, p, side)
-    stage.block("tray_floor", tray, deep, (0, WALL_M), p.tray_colour)
-    stage.block("tray_front", tray, (outer[0], -side), (0, 0.03), p.tray_colour)
-    stage.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
-    stage.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
+    _add_board(course, p, side)
+    course.block("tray_floor", tray, deep, (0, WALL_M), p.tray_colour)
+    course.block("tray_front", tray, (outer[0], -side), (0, 0.03), p.tray_colour)
+    course.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
+    course.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
 
     high, covered = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.incline_m)
-    stage.mark("tray", "tray_floor")
-    return stage.scene(
+    course.mark("tray", "tray_floor")
+    return course.scene(
         p,
         decisive=["block"],
         hidden=["board"],
-        cover=stage.box(covered, across, (0, high), right=stage.ahead(SHADOW_RIGHT * high)),
-        in_view=[stage.box(covered, outer, (0, p.deck_m)), stage.box((highest[0], 0), deep, (0, highest[2]))],
+        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(covered, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
         shown_by={"end": ["deck"]},
     )
 
 
-def _add_board(stage: Stage, p: Params, side: float) -> None:
+def _add_board(course: Course, p: Params, side: float) -> None:
     """The rough board, tilted up a little along the deck: it rises out of the deck, or stays below its surface."""
     begin, end = p.board_span
     half, thick = (end - begin) / 2, 0.03
     rise = half * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
     middle = (begin + half, 0, p.deck_m + rise - thick / 2 - (0.0 if p.rough else SUNK_M))
-    board = stage.slab("board", middle, (half, side - 0.002, thick / 2), "black", falls_rad=-TILT_RAD)
+    board = course.slab("board", middle, (half, side - 0.002, thick / 2), "black", falls_rad=-TILT_RAD)
     board.friction, board.priority = [p.rough_friction, 0.005, 0.0001], 2
 
 

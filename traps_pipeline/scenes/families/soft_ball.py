@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rounded
-from traps_pipeline.scenes.parts.outcome import Reading, still_from
 from traps_pipeline.scenes.parts.questions import colour_from, either, which_colour
-from traps_pipeline.scenes.parts.soft import soft_ball
-from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, still_from
+from traps_pipeline.scenes.parts.soft_bodies import soft_ball
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask
-from traps_pipeline.scenes.wording import choices_in
+from traps_pipeline.scenes.parts.vision import at_rest, colour_mask
+from traps_pipeline.scenes.parts.wording import choices_in
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012
@@ -66,25 +66,25 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Two pairs of bars that reach out of a board, one above the other, the tray below, a cube to one side."""
-    stage = Stage(physics, surface=Surface(solref=SOFT))
+    course = Course(physics, surface=Surface(solref=SOFT))
     end, high = p.half_m, p.upper_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
-    stage.tray("tray", (-end, end), deep, (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10, front=0.04)
-    stage.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
+    course.tray("tray", (-end, end), deep, (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10, front=0.04)
+    course.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
     bars = []
     for pair, (name, height, colour) in enumerate(
         (("upper", p.upper_m, p.upper_colour), ("lower", p.lower_m, p.lower_colour))
     ):
         for side, sign in (("left", -1), ("right", 1)):
             along = sign * (p.gap_m(pair) / 2 + BAR_M)
-            bar = stage.rod(f"{name}_{side}", (along, -0.9 * DEPTH_M, height), (along, DEPTH_M, height), BAR_M, colour)
+            bar = course.rod(f"{name}_{side}", (along, -0.9 * DEPTH_M, height), (along, DEPTH_M, height), BAR_M, colour)
             bar.friction, bar.priority = [0.05, 0.005, 0.0001], 2
             bars.append(bar.name)
     half = p.cube_m / 2
     beside = p.cube_side * (outer + 0.12 + half + (0.14 if p.cube_side > 0 else 0.0))
-    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
     soft_ball(
-        stage,
+        course,
         "ball",
         (0, 0, p.release_m),
         p.radius_m,
@@ -94,17 +94,17 @@ def build(p: Params, physics: Physics) -> Scene:
         mass=0.4,
         pieces=PIECES,
     )
-    stage.mark("upper bars", (-0.95 * end, DEPTH_M), p.upper_colour)
-    stage.mark("lower bars", (-0.6 * end, DEPTH_M), p.lower_colour)
-    stage.mark("tray", (0.6 * end, DEPTH_M), p.tray_colour)
-    return stage.scene(
+    course.mark("upper bars", (-0.95 * end, DEPTH_M), p.upper_colour)
+    course.mark("lower bars", (-0.6 * end, DEPTH_M), p.lower_colour)
+    course.mark("tray", (0.6 * end, DEPTH_M), p.tray_colour)
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=bars,
-        cover=stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.08), (0, high + 0.02), left=0.01, right=0.06),
+        cover=course.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.08), (0, high + 0.02), left=0.01, right=0.06),
         in_view=[
-            stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
-            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
+            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.tray_colour} tray"],
         also=["bar", "board"],

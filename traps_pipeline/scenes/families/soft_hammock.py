@@ -13,15 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rounded
-from traps_pipeline.scenes.parts.outcome import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
-from traps_pipeline.scenes.parts.soft import hammock
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
+from traps_pipeline.scenes.parts.soft_bodies import hammock
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask
+from traps_pipeline.scenes.parts.vision import at_rest, colour_mask
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012
@@ -61,32 +61,32 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Two pairs of posts with the cloth between them, the tray below, a board behind, a cube to one side."""
-    stage = Stage(physics, p.direction, FELT)
+    course = Course(physics, p.direction, FELT)
     end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
     outer, back = end + WALL_M, side + WALL_M
-    stage.tray("tray", (-end, end), (-side, side), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10)
-    stage.block("tray_front", (-outer, outer), (-back, -side), (0, 0.06), p.tray_colour)
-    stage.block("board", (-outer, outer), (side, back), (0, high), p.board_colour)
+    course.tray("tray", (-end, end), (-side, side), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10)
+    course.block("tray_front", (-outer, outer), (-back, -side), (0, 0.06), p.tray_colour)
+    course.block("board", (-outer, outer), (side, back), (0, high), p.board_colour)
     for name, along in (("near", -1), ("far", 1)):
         for where, across in (("front", -1), ("back", 1)):
             at = (along * (p.span_m / 2 + POST_M), across * p.deep_m / 2, high / 2)
-            stage.post(f"post_{name}_{where}", at, POST_M, high / 2, p.post_colour)
-    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + stage.ahead(0.22)
-    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+            course.post(f"post_{name}_{where}", at, POST_M, high / 2, p.post_colour)
+    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + course.ahead(0.22)
+    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
 
     size, tied = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
-    hammock(stage, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied)
-    stage.ball("ball", (0, 0, p.release_m), p.radius_m, p.ball_colour, thrown=(p.drift_m_s, p.toss_m_s), density=350)
-    stage.mark("cloth", (0.55 * end, side), p.cloth_colour)
-    stage.mark("tray", (-0.55 * end, side), p.tray_colour)
-    return stage.scene(
+    hammock(course, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied)
+    course.ball("ball", (0, 0, p.release_m), p.radius_m, p.ball_colour, thrown=(p.drift_m_s, p.toss_m_s), density=350)
+    course.mark("cloth", (0.55 * end, side), p.cloth_colour)
+    course.mark("tray", (-0.55 * end, side), p.tray_colour)
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["cloth"],
-        cover=stage.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=SHADOW_RIGHT * high),
+        cover=course.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=SHADOW_RIGHT * high),
         in_view=[
-            stage.box((-outer, outer), (-back, back), (0, high)),
-            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((-outer, outer), (-back, back), (0, high)),
+            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.cloth_colour} cloth", f"{p.tray_colour} tray"],
         also=["post", "board"],

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.outcome import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
-from traps_pipeline.scenes.parts.soft import rope
-from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
+from traps_pipeline.scenes.parts.soft_bodies import rope
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, largest
+from traps_pipeline.scenes.parts.vision import at_rest, largest
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012
@@ -57,20 +57,20 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A board with the peg in it, the tray before it, a cube to one side."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     end, high = p.length_m / 2 + 0.08, p.peg_m + 0.06
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
     floor = ((-end, end), deep, (0, FLOOR_M))
-    stage.tray("tray", *floor, p.tray_colour, wall=WALL_M, near=0.08, far=0.08, front=0.05, floor=Surface(solref=SOFT))
-    stage.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
+    course.tray("tray", *floor, p.tray_colour, wall=WALL_M, near=0.08, far=0.08, front=0.05, floor=Surface(solref=SOFT))
+    course.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
     along = 0.0 if p.peg_in_middle else p.off_m
-    peg = stage.rod("peg", (along, PEG_FROM_M, p.peg_m), (along, DEPTH_M, p.peg_m), PEG_RADIUS_M, p.peg_colour)
+    peg = course.rod("peg", (along, PEG_FROM_M, p.peg_m), (along, DEPTH_M, p.peg_m), PEG_RADIUS_M, p.peg_colour)
     peg.friction, peg.priority = [0.4, 0.005, 0.0001], 2
 
     half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2
-    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
     rope(
-        stage,
+        course,
         "rope",
         (0, 0, p.release_m),
         p.length_m,
@@ -78,16 +78,16 @@ def build(p: Params, physics: Physics) -> Scene:
         p.rope_colour,
         thrown=(p.drift_m_s, p.toss_m_s),
     )
-    stage.mark("peg", (0.0, DEPTH_M), p.peg_colour)
-    stage.mark("tray", (-0.7 * end, DEPTH_M), p.tray_colour)
-    return stage.scene(
+    course.mark("peg", (0.0, DEPTH_M), p.peg_colour)
+    course.mark("tray", (-0.7 * end, DEPTH_M), p.tray_colour)
+    return course.scene(
         p,
         decisive=["rope"],
         hidden=["peg"],
-        cover=stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.06), (0, high + 0.02), left=0.01, right=0.04),
+        cover=course.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.06), (0, high + 0.02), left=0.01, right=0.04),
         in_view=[
-            stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
-            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
+            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
         ],
         things=[f"{p.rope_colour} rope", f"{p.cube_colour} cube", f"{p.tray_colour} tray"],
         also=["peg", "board"],

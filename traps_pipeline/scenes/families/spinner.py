@@ -14,14 +14,14 @@ from functools import partial
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, distinct_colours
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, offered
-from traps_pipeline.scenes.parts.outcome import Reading, lasting_from
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, which_colour
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, lasting_from
 from traps_pipeline.scenes.parts.vary import between, drawn_by, facing, hidden_index, one_of, shuffled
-from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box, distinct_colours
 
 SECTORS = ("red", "green", "blue", "yellow", "cyan", "purple")
 BALLS = ("red", "green", "blue", "orange", "purple", "cyan")
@@ -64,41 +64,41 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """The hub is at the origin."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
     start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
     deep, outer, floor = (-side, side), (-side - RIM_M, side + RIM_M), (0, TABLE_M)
 
     gripping = Surface(1e-4)
-    stage.block("lane", (start - 0.07, -side), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
-    stage.block("table", deep, deep, floor, p.table_colour, gripping)
-    stage.block("tray", (side, end), deep, floor, p.table_colour, Surface(4e-3))
-    stage.sides("rim", (-side, end), side, RIM_M, rim, p.rim_colour)
-    stage.block("rim_end", (end, end + RIM_M), outer, (0, TABLE_M + 0.06), p.rim_colour)
+    course.block("lane", (start - 0.07, -side), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
+    course.block("table", deep, deep, floor, p.table_colour, gripping)
+    course.block("tray", (side, end), deep, floor, p.table_colour, Surface(4e-3))
+    course.sides("rim", (-side, end), side, RIM_M, rim, p.rim_colour)
+    course.block("rim_end", (end, end + RIM_M), outer, (0, TABLE_M + 0.06), p.rim_colour)
     for i, colour in enumerate(p.sectors):  # thin, and nothing touches them
         angles = np.linspace(FIRST_DEG + i * p.sector_deg, FIRST_DEG + (i + 1) * p.sector_deg, 13)
         corners = [_place(0.03, angles[0]), _place(0.03, angles[-1]), *(_place(p.disc_m, a) for a in angles)]
         heights = (TABLE_M - 0.008, TABLE_M + 0.002)
-        stage.hull(f"sector_{i}", [(x, y, z) for z in heights for x, y in corners], colour)
-    _add_pointer(stage, p)
+        course.hull(f"sector_{i}", [(x, y, z) for z in heights for x, y in corners], colour)
+    _add_pointer(course, p)
     # The peg stands just past the angle at which it is to stop the pointer.
     wide = np.degrees(np.arcsin((PEG_M + POINTER_HALF_M) / PEG_AT_M))
     along, across = _place(PEG_AT_M, FIRST_DEG + (p.stop_sector + p.stop_at) * p.sector_deg + wide)
-    peg = stage.post("peg", (along, across, TABLE_M + 0.03), PEG_M, 0.03, "white")
+    peg = course.post("peg", (along, across, TABLE_M + 0.03), PEG_M, 0.03, "white")
     peg.solref, peg.priority = [0.02, 4], 1  # overdamped: the pointer does not bounce back
     at = (start, lane, TABLE_M + r)
-    stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
+    course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
     seen = (-side, end + RIM_M)
-    stage.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
+    course.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
     for i, colour in enumerate(p.sectors):
-        stage.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
-    return stage.scene(
+        course.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
+    return course.scene(
         p,
         decisive=["pointer"],
         hidden=["peg"],
-        cover=stage.box(seen, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
-        in_view=[stage.box(seen, outer, (0, 0.09))],
+        cover=course.box(seen, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
+        in_view=[course.box(seen, outer, (0, 0.09))],
         things=[f"{p.ball_colour} ball", "black pointer", "spinner", *(f"{c} sector" for c in p.sectors)],
         also=["table", "rim", "peg"],
         colours=[*p.sectors, POINTER_COLOUR],
@@ -112,15 +112,15 @@ def _place(radius: float, angle_deg: float) -> tuple[float, float]:
     return float(radius * np.sin(a)), float(radius * -np.cos(a))
 
 
-def _add_pointer(stage: Stage, p: Params) -> None:
+def _add_pointer(course: Course, p: Params) -> None:
     """A bar that turns about the hub; at the start it points to the near side, across the ball's path."""
     half = POINTER * p.disc_m / 2
-    body = stage.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
+    body = course.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
     joint = body.first_joint()
     joint.frictionloss, joint.armature = 0.003, 0.002
     bar = add_box(body, "pointer", (0, -half, 0), (POINTER_HALF_M, half, 0.016), POINTER_COLOUR)
     bar.density, bar.friction = 300, [0.1, 0.005, 0.0001]
-    stage.post("hub", (0, 0, 0), 0.026, 0.022, POINTER_COLOUR, body=body).density = 300
+    course.post("hub", (0, 0, 0), 0.026, 0.022, POINTER_COLOUR, body=body).density = 300
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

@@ -13,14 +13,14 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, rgba, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, end_of, rounded
-from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, together
-from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box, rgba, uniform
 
 LANE_M = 0.02  # height of the lower lane
 FEEL_M = 0.03  # the ball has met the plunger when it has been this near to it
@@ -78,47 +78,47 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Deck with a tunnel, step, lower lane with a line across, plunger. Lengths run along the roll."""
-    stage = Stage(physics, p.direction, Surface(2e-5, solref=SOFT))
+    course = Course(physics, p.direction, Surface(2e-5, solref=SOFT))
     r, wide = p.radius_m, 1.9 * p.radius_m
     deck, end, line = LANE_M + p.step_m, p.head_m + 0.32, p.head_m - p.line_m
     deep, outer = (-wide, wide), (-wide - WALL_M, wide + WALL_M)
 
-    stage.block("deck", (-r, p.edge_m), deep, (0, deck), p.deck_colour)
-    stage.block("lane", (p.edge_m, end), deep, (0, LANE_M), p.lane_colour, Surface(p.felt, solref=SOFT))
+    course.block("deck", (-r, p.edge_m), deep, (0, deck), p.deck_colour)
+    course.block("lane", (p.edge_m, end), deep, (0, LANE_M), p.lane_colour, Surface(p.felt, solref=SOFT))
     tunnel, roof = (p.run_m - 2.6 * r, p.run_m + 2 * r), deck + 2.4 * r
-    stage.block("tunnel_front", tunnel, (-wide, -wide + WALL_M), (deck, roof), p.tunnel_colour)
-    stage.block("tunnel_back", tunnel, (wide - WALL_M, wide), (deck, roof), p.tunnel_colour)
-    stage.block("tunnel_roof", tunnel, deep, (roof, roof + WALL_M), p.tunnel_colour)
+    course.block("tunnel_front", tunnel, (-wide, -wide + WALL_M), (deck, roof), p.tunnel_colour)
+    course.block("tunnel_back", tunnel, (wide - WALL_M, wide), (deck, roof), p.tunnel_colour)
+    course.block("tunnel_roof", tunnel, deep, (roof, roof + WALL_M), p.tunnel_colour)
     paint = (LANE_M, LANE_M + 0.001)
-    stage.block("line", (line - 0.016, line + 0.016), deep, paint, p.line_colour, solid=False)
-    stage.block("back", (-r, end), (wide, outer[1]), (0, deck + 0.4 * r), p.lane_colour)
-    stage.block("front", (p.edge_m, end), (outer[0], -wide), (0, LANE_M + 0.3 * r), p.lane_colour)
-    stage.block("housing", (end - 0.13, end), deep, (LANE_M, LANE_M + 2.3 * r), p.tunnel_colour)
-    _add_plunger(stage, p)
-    stage.ball("ball", (0, 0, deck + r), r, p.ball_colour, speed=p.speed_m_s)
+    course.block("line", (line - 0.016, line + 0.016), deep, paint, p.line_colour, solid=False)
+    course.block("back", (-r, end), (wide, outer[1]), (0, deck + 0.4 * r), p.lane_colour)
+    course.block("front", (p.edge_m, end), (outer[0], -wide), (0, LANE_M + 0.3 * r), p.lane_colour)
+    course.block("housing", (end - 0.13, end), deep, (LANE_M, LANE_M + 2.3 * r), p.tunnel_colour)
+    _add_plunger(course, p)
+    course.ball("ball", (0, 0, deck + r), r, p.ball_colour, speed=p.speed_m_s)
 
     high, shading = max(deck + 2.2 * r, LANE_M + 2.4 * r), deck + 2 * r
     across = (outer[0], wide + SHADOW_BACK * shading)
-    stage.mark("line", "line")
-    stage.mark("spring", "housing")
-    return stage.scene(
+    course.mark("line", "line")
+    course.mark("spring", "housing")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["head", "rod", *COILS],
-        cover=stage.box((p.run_m, end), across, (0, high), right=SHADOW_RIGHT * shading),
-        in_view=[stage.box((-r, end), outer, (0, high))],
+        cover=course.box((p.run_m, end), across, (0, high), right=SHADOW_RIGHT * shading),
+        in_view=[course.box((-r, end), outer, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.line_colour} line", f"{p.deck_colour} deck", "tunnel", "spring"],
         also=["plunger", "lane", "step"],
         colours=["grey"],
     )
 
 
-def _add_plunger(stage: Stage, p: Params) -> None:
+def _add_plunger(course: Course, p: Params) -> None:
     """Head and rod on a sprung slide joint; the rod and the spring's coils slide into the housing behind them."""
     import mujoco
 
     r, way = p.radius_m, p.direction
-    body = stage.spec.worldbody.add_body(name="plunger", pos=[way * p.head_m, 0, LANE_M + 1.1 * r])
+    body = course.spec.worldbody.add_body(name="plunger", pos=[way * p.head_m, 0, LANE_M + 1.1 * r])
     joint = body.add_joint(name="plunger", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[way, 0, 0])
     joint.stiffness[0], joint.damping[0] = p.stiffness_n_m, p.damping_n_s_m
     head = add_box(body, "head", (way * 0.012, 0, 0), (0.012, 1.5 * r, 0.95 * r), p.head_colour)

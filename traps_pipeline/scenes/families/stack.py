@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.parts import vary
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.outcome import Reading, still_from
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, how_many, range_of
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, still_from
 from traps_pipeline.scenes.parts.vary import between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import blobs, colour_mask, largest
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, largest
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box
 
 RANGES = ((0, 1), (2, 3), (4, 5))  # of standing blocks
 COLOURS = ("red", "green", "blue", "yellow", "purple")  # of the blocks
@@ -77,7 +77,7 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Lengths run along the ball's path from the middle of the stack."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     ledge, stand, half_w = p.ledge_m, p.stand_half_m, p.block_width_m / 2
     plate, end = -half_w - 0.025, stand + p.tray_m
     screened = plate - ROD_M - 2 * RADIUS_M - 0.07
@@ -85,29 +85,29 @@ def build(p: Params, physics: Physics) -> Scene:
     felt = plate - ROD_M - 2 * RADIUS_M - 0.02  # where it begins: the ball comes to rest on it, behind the panel
     deck, high = (ledge - 0.025, ledge), ledge + 0.6 * len(COLOURS) * p.block_height_m
 
-    stage.block("ledge", (start - 0.06, felt), (-0.075, 0.075), deck, p.ledge_colour, Surface(1e-4))
-    stage.block("felt", (felt, -stand - 0.004), (-0.075, 0.075), deck, p.ledge_colour, Surface(4e-3))
+    course.block("ledge", (start - 0.06, felt), (-0.075, 0.075), deck, p.ledge_colour, Surface(1e-4))
+    course.block("felt", (felt, -stand - 0.004), (-0.075, 0.075), deck, p.ledge_colour, Surface(4e-3))
     for i, x in enumerate((start - 0.03, screened - 0.03, -stand - 0.03)):
-        stage.block(f"leg_{i}", (x - 0.012, x + 0.012), (-0.06, 0.06), (0, deck[0]), p.ledge_colour)
-    stage.block("stand", (-stand, stand), (-stand, stand), (0, p.stand_m), STAND_COLOUR)
-    stage.block("wall_back", (screened + 0.01, end), (0.15, 0.165), (0, high), p.wall_colour)
-    stage.block("wall_front", (stand + 0.02, end), (-0.165, -0.15), (0, 0.035), p.wall_colour)
-    stage.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, ledge), p.wall_colour)
-    _add_pusher(stage, p, plate)
+        course.block(f"leg_{i}", (x - 0.012, x + 0.012), (-0.06, 0.06), (0, deck[0]), p.ledge_colour)
+    course.block("stand", (-stand, stand), (-stand, stand), (0, p.stand_m), STAND_COLOUR)
+    course.block("wall_back", (screened + 0.01, end), (0.15, 0.165), (0, high), p.wall_colour)
+    course.block("wall_front", (stand + 0.02, end), (-0.165, -0.15), (0, 0.035), p.wall_colour)
+    course.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, ledge), p.wall_colour)
+    _add_pusher(course, p, plate)
     half = (half_w, half_w, p.block_height_m / 2)
-    stage.tower(BLOCKS, half, p.block_colours, density=300, sliding=0.3, solref=(0.006, 1), base=p.stand_m)
+    course.tower(BLOCKS, half, p.block_colours, density=300, sliding=0.3, solref=(0.006, 1), base=p.stand_m)
     at = (start, 0, ledge + RADIUS_M)
-    stage.ball("ball", at, RADIUS_M, p.ball_colour, speed=p.speed_m_s, rolling=0.0002, density=7500)
+    course.ball("ball", at, RADIUS_M, p.ball_colour, speed=p.speed_m_s, rolling=0.0002, density=7500)
 
     covered, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
-    stage.mark("block", BLOCKS[-1])
-    stage.mark("stand", (0.0, 0.15), STAND_COLOUR)
-    return stage.scene(
+    course.mark("block", BLOCKS[-1])
+    course.mark("stand", (0.0, 0.15), STAND_COLOUR)
+    return course.scene(
         p,
         decisive=BLOCKS,
         hidden=["stand"],
-        cover=stage.box(covered, (-0.17, 0.18), (0, top), right=stage.ahead(0.06)),
-        in_view=[stage.box(covered, (-0.165, 0.165), (0, high))],
+        cover=course.box(covered, (-0.17, 0.18), (0, top), right=course.ahead(0.06)),
+        in_view=[course.box(covered, (-0.165, 0.165), (0, high))],
         things=[f"{p.ball_colour} ball", "black stand", "ledge", *(f"{c} block" for c in p.block_colours)],
         also=["stack", "pusher", "wall"],
         colours=[*p.block_colours, STAND_COLOUR],
@@ -115,12 +115,12 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_pusher(stage: Stage, p: Params, plate: float) -> None:
+def _add_pusher(course: Course, p: Params, plate: float) -> None:
     """A tall plate on a slide, with a rod back to the pad that the ball strikes."""
     import mujoco
 
     way, half = p.direction, (p.stack_m + 0.005) / 2
-    body = stage.spec.worldbody.add_body(name="pusher", pos=[way * plate, 0, p.ledge_m])
+    body = course.spec.worldbody.add_body(name="pusher", pos=[way * plate, 0, p.ledge_m])
     joint = body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[way, 0, 0])
     joint.range, joint.limited = [0, p.travel_m], mujoco.mjtLimited.mjLIMITED_TRUE
     joint.damping, joint.frictionloss, joint.solref_limit = [1.0, 0, 0], 0.3, [0.02, 1.5]

@@ -13,14 +13,14 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import offered, rounded
-from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, which_colour
-from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, blobs, colour_mask, largest
+from traps_pipeline.scenes.parts.vision import at_rest, blobs, colour_mask, largest
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the trays' floors
@@ -72,38 +72,38 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Pedestal, three trays with a high back and a low front, two boards before the back that hang from their upper
     edges."""
-    stage = Stage(physics, surface=Surface(0.006, sliding=0.5, solref=SOFT))
+    course = Course(physics, surface=Surface(0.006, sliding=0.5, solref=SOFT))
     r, side, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
     deep, outer, foot = (-DEPTH_M, DEPTH_M), (-side - WALL_M, side + WALL_M), (start - 0.08, start + 0.08)
-    stage.block("pedestal", foot, (-0.08, 0.08), (0, p.pedestal_m), p.pedestal_colour)
+    course.block("pedestal", foot, (-0.08, 0.08), (0, p.pedestal_m), p.pedestal_colour)
     throw = (p.direction * p.speed_along_m_s, p.speed_up_m_s)
-    stage.ball("ball", (start, 0, p.start_m), r, p.ball_colour, thrown=throw, rolling=0.0002)
+    course.ball("ball", (start, 0, p.start_m), r, p.ball_colour, thrown=throw, rolling=0.0002)
     for i, colour in enumerate(p.tray_colours):
         ends = (i * p.tray_m - side, (i + 1) * p.tray_m - side)
-        stage.block(f"tray_{i}", ends, deep, (0, FLOOR_M), colour)
-        stage.block(f"front_{i}", ends, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.3 * r), colour)
-        stage.block(f"rear_{i}", ends, (DEPTH_M - WALL_M, DEPTH_M), (0, DIVIDER_M), colour)
+        course.block(f"tray_{i}", ends, deep, (0, FLOOR_M), colour)
+        course.block(f"front_{i}", ends, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.3 * r), colour)
+        course.block(f"rear_{i}", ends, (DEPTH_M - WALL_M, DEPTH_M), (0, DIVIDER_M), colour)
     for i in (1, 2):
         x = i * p.tray_m - side
-        stage.block(f"divider_{i}", (x - WALL_M / 2, x + WALL_M / 2), deep, (0, DIVIDER_M), p.back_colour)
-    stage.block("end_left", (outer[0], -side), deep, (0, END_M), p.back_colour)
-    stage.block("end_right", (side, outer[1]), deep, (0, END_M), p.back_colour)
-    stage.block("back", outer, (DEPTH_M, DEPTH_M + WALL_M), (0, p.mouth_m), p.back_colour)
+        course.block(f"divider_{i}", (x - WALL_M / 2, x + WALL_M / 2), deep, (0, DIVIDER_M), p.back_colour)
+    course.block("end_left", (outer[0], -side), deep, (0, END_M), p.back_colour)
+    course.block("end_right", (side, outer[1]), deep, (0, END_M), p.back_colour)
+    course.block("back", outer, (DEPTH_M, DEPTH_M + WALL_M), (0, p.mouth_m), p.back_colour)
     angle, half = p.slant * radians(p.slant_deg), (0.006, DEPTH_M - 0.03, p.board_m / 2)
     for i, hinge in enumerate((-p.gap * r / 2, p.gap * r / 2)):
         centre = (hinge + p.board_m / 2 * sin(angle), 0.0, p.mouth_m - p.board_m / 2 * cos(angle))
-        board = stage.slab(f"board_{i}", centre, half, "wood", falls_rad=-angle)
+        board = course.slab(f"board_{i}", centre, half, "wood", falls_rad=-angle)
         Surface(0.001, sliding=0.3, solref=SOFT).on(board)
     for i, colour in enumerate(p.tray_colours):
-        stage.mark(f"{colour} tray", f"tray_{i}")
-    return stage.scene(
+        course.mark(f"{colour} tray", f"tray_{i}")
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["board_0", "board_1"],
-        cover=stage.box(outer, (-DEPTH_M - WALL_M, DEPTH_M + 0.10), (0, p.mouth_m + 0.06), right=0.03),
+        cover=course.box(outer, (-DEPTH_M - WALL_M, DEPTH_M + 0.10), (0, p.mouth_m + 0.06), right=0.03),
         in_view=[
-            stage.box(outer, (-DEPTH_M - WALL_M, DEPTH_M + WALL_M), (0, p.mouth_m)),
-            stage.box(foot, (-0.08, 0.08), (0, p.pedestal_m)),
+            course.box(outer, (-DEPTH_M - WALL_M, DEPTH_M + WALL_M), (0, p.mouth_m)),
+            course.box(foot, (-0.08, 0.08), (0, p.pedestal_m)),
         ],
         things=[f"{p.ball_colour} ball", *(f"{c} tray" for c in p.tray_colours), "pedestal"],
         also=["chute", "board", "wall"],

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import lies_flat
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, largest, track
+from traps_pipeline.scenes.parts.vision import at_rest, largest, track
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FELT = Surface(2e-3)  # behind the panel: no ball comes back from there
 LIGHT, HEAVY = 200.0, 7000.0  # kg/m3
@@ -56,41 +56,41 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Lengths run along the ball's path from the middle of the pillar."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.width_m / 2, HALF_DEPTH_M
     ledge = p.strike * p.pillar_m - r  # height of the ledge that the ball rolls on
     ledge_end, end = -half_w - 0.025, half_w + p.pillar_m + 0.09  # the pillar falls onto the mat between them
     screened = ledge_end - 3 * r - 0.10
     start = screened - p.run_m + r
 
-    stage.block("ledge", (start - 0.06, screened + 2 * r), (-0.09, 0.09), (0, ledge), p.ledge_colour, Surface(1e-4))
-    stage.block("felt", (screened + 2 * r, ledge_end), (-0.09, 0.09), (0, ledge), p.ledge_colour, FELT)
-    stage.block("mat", (ledge_end, end), (-deep, deep), (0, MAT_M), p.mat_colour)
-    stage.block("rim_back", (ledge_end, end), (deep, deep + RIM_M), (0, 0.06), p.mat_colour)
-    stage.block("rim_front", (half_w + 0.02, end), (-deep - RIM_M, -deep), (0, 0.03), p.mat_colour)
-    stage.block("rim_end", (end, end + RIM_M), (-deep - RIM_M, deep + RIM_M), (0, 0.06), p.mat_colour)
+    course.block("ledge", (start - 0.06, screened + 2 * r), (-0.09, 0.09), (0, ledge), p.ledge_colour, Surface(1e-4))
+    course.block("felt", (screened + 2 * r, ledge_end), (-0.09, 0.09), (0, ledge), p.ledge_colour, FELT)
+    course.block("mat", (ledge_end, end), (-deep, deep), (0, MAT_M), p.mat_colour)
+    course.block("rim_back", (ledge_end, end), (deep, deep + RIM_M), (0, 0.06), p.mat_colour)
+    course.block("rim_front", (half_w + 0.02, end), (-deep - RIM_M, -deep), (0, 0.03), p.mat_colour)
+    course.block("rim_end", (end, end + RIM_M), (-deep - RIM_M, deep + RIM_M), (0, 0.06), p.mat_colour)
     has_prop = p.kind == "prop"
     if has_prop:
         near, y = half_w + 0.004, 0.0 if p.firm else deep - 0.03
         height = p.prop_height * p.pillar_m
-        stage.block("prop", (near, near + 0.07), (y - 0.03, y + 0.03), (MAT_M, height), p.prop_colour)
+        course.block("prop", (near, near + 0.07), (y - 0.03, y + 0.03), (MAT_M, height), p.prop_colour)
     at, half = (0, 0, MAT_M + p.pillar_m / 2), (half_w, p.depth_m / 2, p.pillar_m / 2)
     density = HEAVY if p.firm and p.kind == "pillar" else LIGHT
-    pillar = stage.free_box("pillar", at, half, p.pillar_colour, density=density, solref=(0.006, 1))
+    pillar = course.free_box("pillar", at, half, p.pillar_colour, density=density, solref=(0.006, 1))
     pillar.first_geom().friction = [0.8, 0.01, 0.0005]
     at = (start, 0, ledge + r)
-    stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=1500)
+    course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=1500)
 
     covered, top = (screened, end + 0.02), p.pillar_m + 0.03
     across = (-deep - 0.02, max(deep + 0.05, 0.05 + SHADOW_BACK * p.pillar_m))
     props = [f"{p.prop_colour} block"] if has_prop else []
-    stage.mark("pillar", "pillar")
-    scene = stage.scene(
+    course.mark("pillar", "pillar")
+    scene = course.scene(
         p,
         decisive=["pillar"],
         hidden=[p.kind],
-        cover=stage.box(covered, across, (0, top), right=stage.ahead(0.04)),
-        in_view=[stage.box(covered, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
+        cover=course.box(covered, across, (0, top), right=course.ahead(0.04)),
+        in_view=[course.box(covered, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
         things=[f"{p.ball_colour} ball", f"{p.pillar_colour} pillar", "ledge", "mat", *props],
         also=["block", "rim"],
     )

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import end_of
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask, largest, track
+from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, track
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 STRIP_M = 0.16  # length of the strip that is rough or smooth
 FELT = Surface(2e-3)  # behind the panel: no ball comes back from there
@@ -71,7 +71,7 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Lengths run along the ball's path from the middle of the tower."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
     ledge = p.strike * p.block_height_m - r  # height of the ledge that the ball rolls on
     ledge_end, end = -half_w - 0.02, half_w + p.tray_m
@@ -86,28 +86,28 @@ def build(p: Params, physics: Physics) -> Scene:
         ("strip", strip, rough if p.barred and is_strip else FELT, "black" if is_strip else p.ledge_colour),
         ("ledge_out", (strip[1], ledge_end), FELT, p.ledge_colour),
     ):
-        stage.block(name, along, deep, (0, ledge), colour, surface)
+        course.block(name, along, deep, (0, ledge), colour, surface)
     if p.kind == "stop":
         y = 0.0 if p.barred else HALF_DEPTH_M - 0.018
-        stage.block("stop", (strip[1] - 0.05, strip[1]), (y - 0.018, y + 0.018), (ledge, ledge + 1.6 * r), "black")
-    stage.block("wall_back", (half_w + 0.02, end), (0.15, 0.165), (0, 0.10), p.tray_colour)
-    stage.block("wall_front", (half_w + 0.02, end), (-0.165, -0.15), (0, 0.03), p.tray_colour)
-    stage.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, 0.16), p.tray_colour)
+        course.block("stop", (strip[1] - 0.05, strip[1]), (y - 0.018, y + 0.018), (ledge, ledge + 1.6 * r), "black")
+    course.block("wall_back", (half_w + 0.02, end), (0.15, 0.165), (0, 0.10), p.tray_colour)
+    course.block("wall_front", (half_w + 0.02, end), (-0.165, -0.15), (0, 0.03), p.tray_colour)
+    course.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, 0.16), p.tray_colour)
     colours = [p.block_colours[i % len(p.block_colours)] for i in range(p.blocks - 1)] + [p.top_colour]
     half = (half_w, half_w, p.block_height_m / 2)
-    stage.tower(p.names, half, colours, density=300, sliding=0.35, solref=(0.006, 1))
+    course.tower(p.names, half, colours, density=300, sliding=0.35, solref=(0.006, 1))
     at = (start, 0, ledge + r)
-    stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.3, density=2500)
+    course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.3, density=2500)
 
-    seen = stage.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
-    right = max(seen.high[0], SHADOW_RIGHT * p.tower_m + half_w) + stage.ahead(0.07) - seen.high[0]
+    seen = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
+    right = max(seen.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - seen.high[0]
     across = (-0.17, half_w + SHADOW_BACK * p.tower_m)
-    stage.mark("block", p.names[-1])
-    return stage.scene(
+    course.mark("block", p.names[-1])
+    return course.scene(
         p,
         decisive=[p.names[-1]],
         hidden=[p.kind],
-        cover=stage.box((screened, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
+        cover=course.box((screened, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
         in_view=[seen],
         things=[
             f"{p.ball_colour} ball",

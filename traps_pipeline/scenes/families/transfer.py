@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_BACK, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, lies_on, reaches
-from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.ramp import SteppedRamp
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 DECK_M = 0.03
 STEP_M = 0.022  # the ramp ends this high over the deck
@@ -66,45 +66,45 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Ramp, step, deck with low rims, zone before an end wall."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, end, board_at = p.radius_m, p.zone_at_m + p.zone_m, p.block_at_m - p.block_m / 2 - 0.03
     deep, outer, deck = (-SIDE_M, SIDE_M), (-SIDE_M - WALL_M, SIDE_M + WALL_M), (0, DECK_M)
     board = Surface(4e-4, sliding=p.rough_friction if p.rough else p.slick_friction, priority=2)
 
     ramp = SteppedRamp(p.ramp_m, p.slope_deg, DECK_M + STEP_M)
-    ramp.add(stage, SIDE_M, p.ramp_colour)
-    stage.ball("ball", ramp.at(p.start_m, r), r, p.ball_colour, rolling=0.0002, density=800)
-    stage.block("deck", (p.ramp_m, board_at), deep, deck, p.deck_colour)
-    stage.block("board", (board_at, p.zone_at_m), deep, deck, p.deck_colour, board)
-    stage.block("zone", (p.zone_at_m, end), deep, deck, p.zone_colour, Surface(4e-4, sliding=0.25, priority=2))
-    stage.sides("rim", (p.ramp_m, end), SIDE_M, WALL_M, (0, DECK_M + 0.016), p.ramp_colour)
-    wall = stage.block("end_wall", (end, end + WALL_M), outer, (0, DECK_M + 0.05), p.ramp_colour)
+    ramp.add(course, SIDE_M, p.ramp_colour)
+    course.ball("ball", ramp.at(p.start_m, r), r, p.ball_colour, rolling=0.0002, density=800)
+    course.block("deck", (p.ramp_m, board_at), deep, deck, p.deck_colour)
+    course.block("board", (board_at, p.zone_at_m), deep, deck, p.deck_colour, board)
+    course.block("zone", (p.zone_at_m, end), deep, deck, p.zone_colour, Surface(4e-4, sliding=0.25, priority=2))
+    course.sides("rim", (p.ramp_m, end), SIDE_M, WALL_M, (0, DECK_M + 0.016), p.ramp_colour)
+    wall = course.block("end_wall", (end, end + WALL_M), outer, (0, DECK_M + 0.05), p.ramp_colour)
     wall.priority = 3  # dead: the block stays where it strikes the wall
-    _add_target(stage, p)
+    _add_target(course, p)
 
     high = DECK_M + max(p.block_m, 2 * r)
     covered, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
-    stage.mark("block", "block")
-    stage.mark("zone", "zone")
-    return stage.scene(
+    course.mark("block", "block")
+    course.mark("zone", "zone")
+    return course.scene(
         p,
         decisive=["block"],
         hidden=["board"],
-        cover=stage.box(covered, across, (0, high), right=0.45 * high),
-        in_view=[stage.box((0, end), outer, (0, high))],
+        cover=course.box(covered, across, (0, high), right=0.45 * high),
+        in_view=[course.box((0, end), outer, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.zone_colour} zone", "ramp"],
         also=["deck", "wall"],
     )
 
 
-def _add_target(stage: Stage, p: Params) -> None:
+def _add_target(course: Course, p: Params) -> None:
     """The free block, a cube or an upright cylinder."""
     import mujoco
 
     half = p.block_m / 2
     at = (p.block_at_m, 0, DECK_M + half)
     lively = (-20000.0, -25.0)
-    body = stage.free_box("block", at, (half, half, half), p.block_colour, density=700, sliding=0.1, solref=lively)
+    body = course.free_box("block", at, (half, half, half), p.block_colour, density=700, sliding=0.1, solref=lively)
     geom = body.first_geom()
     geom.priority = 1
     if p.shape == "cylinder":

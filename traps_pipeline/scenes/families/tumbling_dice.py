@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, add_box, uniform
+from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.outcome import Reading, undecided
 from traps_pipeline.scenes.parts.questions import either, goes_to, which_colour
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.parts.readings import Reading, undecided
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, add_box, uniform
 
 FACES = ("red", "green", "blue", "cyan", "orange", "yellow")
 EDGES = ("white", "black", "purple")  # nothing else in the scene has them
@@ -109,59 +109,59 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Steps and tray between two walls. Lengths run down the steps."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     # The edges keep their colour in shade.
-    stage.spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)
+    course.spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)
     side, end, high = p.width_m / 2, p.run_m + p.tray_m, p.floor_m(0)
     front, back = (-side - WALL_M, -side), (side, side + WALL_M)
     treads = [(i * p.step_m, (i + 1) * p.step_m) for i in range(p.steps)]
 
     for i, along in enumerate(treads):
-        step = stage.block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), "wood")
+        step = course.block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), "wood")
         if i % 2 != p.dark_first:
             step.rgba = DARK_WOOD
-    stage.block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "grey")
+    course.block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "grey")
     rim = TRAY_M + 1.6 * p.half_m  # low, so that it hides and shades no die; glass stands on it
-    stage.block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
-    stage.block("tray_front", (p.run_m, end + WALL_M), front, (0, rim), "wood")
-    stage.block("wall_back", (-WALL_M, end + WALL_M), back, (0, high + 2 * p.half_m), "wood")
+    course.block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
+    course.block("tray_front", (p.run_m, end + WALL_M), front, (0, rim), "wood")
+    course.block("wall_back", (-WALL_M, end + WALL_M), back, (0, high + 2 * p.half_m), "wood")
     for i, along in enumerate(treads):  # a low front wall that follows the steps, so that it hides nothing
-        stage.block(f"front_{i}", along, front, (0, p.floor_m(i) + 0.5 * p.half_m), "wood")
+        course.block(f"front_{i}", along, front, (0, p.floor_m(i) + 0.5 * p.half_m), "wood")
     whole = (-WALL_M, end + WALL_M)
     panes = {"front": (whole, front), "back": (whole, back)}
     panes |= {"top": ((-WALL_M, 0), (-side, side)), "end": ((end, end + WALL_M), (-side, side))}
     for name, (along, across) in panes.items():
-        glass = stage.block(f"fence_{name}", along, across, (0, high + 1.0), "white")
+        glass = course.block(f"fence_{name}", along, across, (0, high + 1.0), "white")
         glass.rgba = [1, 1, 1, 0]  # nothing leaves the steps; a drawn pane would tint the faces: its edges are drawn
-    _add_glass_edges(stage, (0, end), side, (TRAY_M, high + 1.0))
+    _add_glass_edges(course, (0, end), side, (TRAY_M, high + 1.0))
     for i in range(len(p.faces)):
-        _add_die(stage, p, i)
+        _add_die(course, p, i)
     dice = [f"die_{i}" for i in range(len(p.faces))]
-    scene = stage.scene(
+    scene = course.scene(
         p,
         decisive=dice,
-        in_view=[stage.box(whole, (front[0], back[1]), (0, TRAY_M))],
+        in_view=[course.box(whole, (front[0], back[1]), (0, TRAY_M))],
         also=["die", "step", "tray", "wall", "face"],
         colours=sorted({*FACES, *p.edge_colours, "grey", "wood"}),
     )
     throws = [(p.direction * along, across, up) for along, across, up in p.speeds_m_s]
     velocity = {d: (*v, *w) for d, v, w in zip(dice, throws, p.spins_rad_s, strict=True)}
-    return replace(scene, velocity=velocity, rest=stage.box((p.run_m, end), (-side, side), (0, rim)))
+    return replace(scene, velocity=velocity, rest=course.box((p.run_m, end), (-side, side), (0, rim)))
 
 
-def _add_glass_edges(stage: Stage, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:
+def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:
     """The edges of the glass box that dice bounce off: four upright ones from floor to top, and the rails around it."""
     bars = [((x, y, up[0]), (x, y, up[1])) for x in along for y in (-side, side)]
     bars += [((along[0], y, up[1]), (along[1], y, up[1])) for y in (-side, side)]
     bars += [((x, -side, up[1]), (x, side, up[1])) for x in along]
     for i, (a, b) in enumerate(bars):
-        stage.rod(f"glass_{i}", a, b, GLASS_EDGE_M, "white", solid=False).rgba = GLASS
+        course.rod(f"glass_{i}", a, b, GLASS_EDGE_M, "white", solid=False).rgba = GLASS
 
 
-def _add_die(stage: Stage, p: Params, i: int) -> None:
+def _add_die(course: Course, p: Params, i: int) -> None:
     """A cube in the edge colour with a thin plate, drawn only, on every face."""
     (along, across, above), h, edge = p.starts_m[i], p.half_m, p.edge_colours[i]
-    body = stage.free_box(f"die_{i}", (along, across, p.floor_m(0) + above), (h, h, h), edge, density=600.0)
+    body = course.free_box(f"die_{i}", (along, across, p.floor_m(0) + above), (h, h, h), edge, density=600.0)
     body.quat, cube = list(p.turns[i]), body.first_geom()
     if edge != "black":
         cube.material = "bright"

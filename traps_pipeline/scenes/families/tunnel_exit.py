@@ -13,15 +13,15 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, end_of, small
-from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, left_or_right
 from traps_pipeline.scenes.parts.ramp import Ramp
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, shuffled
-from traps_pipeline.scenes.vision import largest
+from traps_pipeline.scenes.parts.vision import largest
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.05
 TRAY_M = 0.02  # lower than the tunnel, so that no ball rolls back into it
@@ -58,42 +58,42 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """The fork stands in the middle, its front at the origin; the ramp leads down to it from the back."""
-    stage = Stage(physics)
+    course = Course(physics)
     r, wide, depth = p.radius_m, p.half_width_m, p.depth_m
     roof, bore, end = FLOOR_M + 2.8 * r, 1.3 * r, p.half_width_m + p.tray_m
     fork, before, behind = (-wide, wide), (-WALL_M, 0), (depth, depth + WALL_M)
 
-    stage.block("fork_floor", fork, (0, depth), (0, FLOOR_M), p.tunnel_colour)
-    stage.block("fork_roof", fork, (-WALL_M, depth + WALL_M), (roof, roof + WALL_M), p.tunnel_colour)
-    stage.block("fork_front", fork, before, (0, roof), p.tunnel_colour, SLIPPERY)
+    course.block("fork_floor", fork, (0, depth), (0, FLOOR_M), p.tunnel_colour)
+    course.block("fork_roof", fork, (-WALL_M, depth + WALL_M), (roof, roof + WALL_M), p.tunnel_colour)
+    course.block("fork_front", fork, before, (0, roof), p.tunnel_colour, SLIPPERY)
     for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
-        way_out, tray, high = stage.towards(side), (wide, end), (0, TRAY_M + 1.2 * r)
+        way_out, tray, high = course.towards(side), (wide, end), (0, TRAY_M + 1.2 * r)
         way_out.block(f"fork_back_{name}", (bore, wide), behind, (0, roof), p.tunnel_colour)
         way_out.block(f"tray_{name}", tray, (-WALL_M, depth), (0, TRAY_M), colour, FELT)
         way_out.block(f"tray_end_{name}", (end, end + WALL_M), (-WALL_M, depth), high, colour)
         way_out.block(f"tray_front_{name}", tray, (-2 * WALL_M, -WALL_M), (0, TRAY_M + 0.5 * r), colour)
         way_out.block(f"tray_back_{name}", tray, behind, high, colour)
     half = (2.3 * r, 0.006, (roof - 0.004 - FLOOR_M) / 2)
-    deflector = SLIPPERY.on(stage.slab("deflector", (0, 0.45 * depth, (FLOOR_M + roof) / 2), half, "black"))
+    deflector = SLIPPERY.on(course.slab("deflector", (0, 0.45 * depth, (FLOOR_M + roof) / 2), half, "black"))
     yaw = p.turn * float(np.radians(p.turn_deg)) + np.pi / 2
     deflector.quat = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
     ramp = Ramp(p.slope_deg, FLOOR_M, foot_m=depth, towards_camera=True)
-    _add_ramp(stage, p, ramp, bore)
+    _add_ramp(course, p, ramp, bore)
     start = ramp.at(p.covered_m + p.open_m - p.start_m, r)
-    stage.ball("ball", start, r, p.ball_colour, rolling=1e-4)
+    course.ball("ball", start, r, p.ball_colour, rolling=1e-4)
 
     side, across = end + WALL_M, (-2 * WALL_M - 0.01, depth + 2 * WALL_M)
-    cover = stage.box((-side - 0.01, side), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
+    cover = course.box((-side - 0.01, side), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
     for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
-        stage.mark(f"{name} exit", (side * wide, depth), colour)
-    return stage.scene(
+        course.mark(f"{name} exit", (side * wide, depth), colour)
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["deflector"],
         cover=cover,
         in_view=[
             cover,
-            stage.box((-bore - WALL_M, bore + WALL_M), (depth, start[1] + p.start_m), (0, start[2] + r)),
+            course.box((-bore - WALL_M, bore + WALL_M), (depth, start[1] + p.start_m), (0, start[2] + r)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.tunnel_colour} tunnel", "ramp", "upper end of the ramp"],
         also=["tray", "exit"],
@@ -101,13 +101,13 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_ramp(stage: Stage, p: Params, ramp: Ramp, bore: float) -> None:
+def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
     """The ramp with its cover below, its rails above, and a post under its upper end."""
     length, outer, top = p.covered_m + p.open_m, bore + WALL_M, 2.7 * p.radius_m
 
     def board(name: str, across: Span, up: Span, over: Span, colour: str, side: int = 1) -> None:
         along, aside, out = ((span[1] - span[0]) / 2 for span in (up, across, over))
-        ramp.board(stage, name, sum(up) / 2, sum(over) / 2, (along, aside, out), colour, aside=side * sum(across) / 2)
+        ramp.board(course, name, sum(up) / 2, sum(over) / 2, (along, aside, out), colour, aside=side * sum(across) / 2)
 
     board("ramp", (-outer, outer), (0, length), (-0.02, 0), p.ramp_colour)
     board("stem_roof", (-outer, outer), (0, p.covered_m), (top, top + WALL_M), p.tunnel_colour)
@@ -115,7 +115,7 @@ def _add_ramp(stage: Stage, p: Params, ramp: Ramp, bore: float) -> None:
         board(f"stem_{side}", (bore, outer), (0, p.covered_m), (0, top), p.tunnel_colour, side)
         board(f"rail_{side}", (bore, outer), (p.covered_m, length), (0, 0.4 * p.radius_m), p.ramp_colour, side)
     _, y, z = ramp.at(length - 0.05)
-    stage.slab("ramp_post", (0, y, (z - 0.03) / 2), (outer, 0.02, (z - 0.03) / 2), p.ramp_colour)
+    course.slab("ramp_post", (0, y, (z - 0.03) / 2), (outer, 0.02, (z - 0.03) / 2), p.ramp_colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

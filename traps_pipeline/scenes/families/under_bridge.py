@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, Vec3
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
-from traps_pipeline.scenes.parts.outcome import Reading, came_through
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, came_through
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, Vec3
 
 ROAD_M = 0.02
 SLAB_M = 0.03
@@ -54,34 +54,34 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """A ramp, a road with an end wall, a bridge on four legs across the road."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, end, side = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
     deep, road = (-side, side), (0, ROAD_M)
     stop = 0.62 * p.bridge_m + r  # where the kerb's face is: the ball rests in the middle of the bridge
     bed = (stop - 3.5 * r, stop)  # rough: a ball that bounces off the kerb stays there
 
-    stage.block("road_in", (-p.flat_m, bed[0]), deep, road, p.road_colour, Surface(1e-4))
-    stage.block("road_bed", bed, deep, road, p.road_colour, Surface(0.003))
-    stage.block("road_out", (bed[1], end), deep, road, p.road_colour, Surface(0.004))
-    stage.block("end_wall", (end, end + 0.015), deep, (0, ROAD_M + 1.4 * r), p.road_colour)
-    start = _add_ramp(stage, p, side)
-    _add_bridge(stage, p)
+    course.block("road_in", (-p.flat_m, bed[0]), deep, road, p.road_colour, Surface(1e-4))
+    course.block("road_bed", bed, deep, road, p.road_colour, Surface(0.003))
+    course.block("road_out", (bed[1], end), deep, road, p.road_colour, Surface(0.004))
+    course.block("end_wall", (end, end + 0.015), deep, (0, ROAD_M + 1.4 * r), p.road_colour)
+    start = _add_ramp(course, p, side)
+    _add_bridge(course, p)
     along, across, up = (stop, stop + 0.04), deep, (ROAD_M, ROAD_M + 0.9 * r)
     if not p.blocked:
         along, across, up = (stop + 0.02 - side, stop + 0.02 + side), (side, side + 0.04), (0, 0.9 * r)
-    stage.block("kerb", along, across, up, p.kerb_colour, Surface(0.001, sliding=0.2))
-    stage.ball("ball", start, r, p.ball_colour, rolling=1e-4)
+    course.block("kerb", along, across, up, p.kerb_colour, Surface(0.001, sliding=0.2))
+    course.ball("ball", start, r, p.ball_colour, rolling=1e-4)
 
     high, front = ROAD_M + 2.1 * r, -p.span_m / 2 - 0.01
     top = p.height_m + p.hump_m + SLAB_M + RAILING_M + 0.03
-    return stage.scene(
+    return course.scene(
         p,
         decisive=["ball"],
         hidden=["kerb"],
-        cover=stage.cover((p.mouth_m, end + 0.015), (front, side + 0.04), high),
+        cover=course.cover((p.mouth_m, end + 0.015), (front, side + 0.04), high),
         in_view=[
-            stage.box((-(p.flat_m + p.ramp_m), end), deep, (0, high)),
-            stage.box((0, p.bridge_m), (front, -front), (0, top)),
+            course.box((-(p.flat_m + p.ramp_m), end), deep, (0, high)),
+            course.box((0, p.bridge_m), (front, -front), (0, top)),
         ],
         things=[
             f"{p.ball_colour} ball",
@@ -95,22 +95,22 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_ramp(stage: Stage, p: Params, side: float) -> Vec3:
+def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
     """The ramp down to the road; gives the place where the ball starts on it."""
     slope, thick = float(np.radians(p.slope_deg)), 0.012
     length = p.ramp_m / np.cos(slope)
     foot = np.array([-p.flat_m, ROAD_M])
     up, normal = np.array([-np.cos(slope), np.sin(slope)]), np.array([np.sin(slope), np.cos(slope)])
     middle = foot + up * length / 2 - normal * thick
-    stage.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thick), p.ramp_colour, falls_rad=slope)
+    course.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thick), p.ramp_colour, falls_rad=slope)
     top = foot + up * (length - 0.03) - normal * thick
     half = (top[1] - 0.008) / 2
-    stage.slab("ramp_post", (top[0], 0, half), (0.02, side * 0.8, half), p.ramp_colour)
+    course.slab("ramp_post", (top[0], 0, half), (0.02, side * 0.8, half), p.ramp_colour)
     ball = foot + up * (length - 1.2 * p.radius_m) + normal * p.radius_m
     return float(ball[0]), 0.0, float(ball[1])
 
 
-def _add_bridge(stage: Stage, p: Params) -> None:
+def _add_bridge(course: Course, p: Params) -> None:
     """A humped deck of planks on four legs, with a railing on either edge."""
     side, post, pitch, colour = p.span_m / 2, 0.014, p.span_m / p.planks, p.bridge_colour
     edges = ((0, 2 * post), (p.bridge_m - 2 * post, p.bridge_m))
@@ -118,13 +118,13 @@ def _add_bridge(stage: Stage, p: Params) -> None:
         y = -side + (k + 0.5) * pitch
         z = p.height_m + p.hump_m * (1 - (y / side) ** 2)
         rail = z + SLAB_M + RAILING_M
-        stage.block(f"plank_{k}", (0, p.bridge_m), (y - 0.47 * pitch, y + 0.47 * pitch), (z, z + SLAB_M), colour)
+        course.block(f"plank_{k}", (0, p.bridge_m), (y - 0.47 * pitch, y + 0.47 * pitch), (z, z + SLAB_M), colour)
         for i, along in enumerate(edges):
-            stage.block(f"handrail_{i}{k}", along, (y - pitch / 2, y + pitch / 2), (rail, rail + 0.03), colour)
+            course.block(f"handrail_{i}{k}", along, (y - pitch / 2, y + pitch / 2), (rail, rail + 0.03), colour)
             if k % 2 == 0:
-                stage.block(f"post_{i}{k}", along, (y - post / 2, y + post / 2), (z + SLAB_M, rail), colour)
+                course.block(f"post_{i}{k}", along, (y - post / 2, y + post / 2), (z + SLAB_M, rail), colour)
             if k in (0, p.planks - 1):
-                stage.block(f"leg_{i}{k}", along, (y - post, y + post), (0, z), colour)
+                course.block(f"leg_{i}{k}", along, (y - post, y + post), (0, z), colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

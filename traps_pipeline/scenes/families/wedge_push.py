@@ -13,14 +13,14 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, uniform
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, end_of, lies_on
-from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.vision import largest, track
+from traps_pipeline.scenes.parts.vision import largest, track
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box, uniform
 
 TRACK_M = 0.03  # thickness of the track
 HALF_TRACK_M = 0.13
@@ -60,7 +60,7 @@ class Params:
 
 def build(p: Params, physics: Physics) -> Scene:
     """Lengths run along the track from the middle of the wedge."""
-    stage = Stage(physics, p.direction)
+    course = Course(physics, p.direction)
     r, half, end = p.radius_m, p.wedge_length_m / 2, p.mat_at_m + p.mat_m
     strip = (half + 0.03, half + 0.03 + STRIP_M)
     screened = -half - 2 * r - 0.08
@@ -74,24 +74,24 @@ def build(p: Params, physics: Physics) -> Scene:
         ("track_end", (strip[1], p.mat_at_m), SLIPPERY, p.track_colour),
         ("mat", (p.mat_at_m, end), SLIPPERY, p.mat_colour),
     ):
-        stage.block(name, along, deep, (0, TRACK_M), colour, surface)
+        course.block(name, along, deep, (0, TRACK_M), colour, surface)
     if p.kind == "stop":
         y, z = (0.0, TRACK_M) if p.barred else (HALF_TRACK_M + 0.05, 0.0)
-        stage.block("stop", (strip[1] - 0.03, strip[1]), (y - 0.04, y + 0.04), (z, z + 0.07), "black")
-    stage.block("wall_end", (end, end + 0.015), deep, (0, TRACK_M + 0.05), p.track_colour)
-    _add_wedge(stage, p)
+        course.block("stop", (strip[1] - 0.03, strip[1]), (y - 0.04, y + 0.04), (z, z + 0.07), "black")
+    course.block("wall_end", (end, end + 0.015), deep, (0, TRACK_M + 0.05), p.track_colour)
+    _add_wedge(course, p)
     at = (start, 0, TRACK_M + r)
-    stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
+    course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
     seen, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
-    stage.mark("wedge", "base", p.wedge_colour)
-    stage.mark("mat", "mat")
-    return stage.scene(
+    course.mark("wedge", "base", p.wedge_colour)
+    course.mark("mat", "mat")
+    return course.scene(
         p,
         decisive=["wedge"],
         hidden=[p.kind],
-        cover=stage.box(seen, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
-        in_view=[stage.box(seen, (-HALF_TRACK_M, back), (0, top))],
+        cover=course.box(seen, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
+        in_view=[course.box(seen, (-HALF_TRACK_M, back), (0, top))],
         things=[
             f"{p.ball_colour} ball",
             f"{p.wedge_colour} wedge",
@@ -104,13 +104,13 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _add_wedge(stage: Stage, p: Params) -> None:
+def _add_wedge(course: Course, p: Params) -> None:
     """A free body that looks like a wedge, high end towards the ball; a base and a back plate inside it collide."""
     half, wide, high = p.wedge_length_m / 2, p.wedge_width_m / 2, p.wedge_height_m
     profile = ((-half, 0.0), (half, 0.0), (half, 0.025), (-half, high))
-    body = stage.spec.worldbody.add_body(name="wedge", pos=[0, 0, TRACK_M])
+    body = course.spec.worldbody.add_body(name="wedge", pos=[0, 0, TRACK_M])
     body.add_freejoint()
-    stage.hull("wedge", [(x, y, z) for y in (-wide, wide) for x, z in profile], p.wedge_colour, body=body).mass = 0.0
+    course.hull("wedge", [(x, y, z) for y in (-wide, wide) for x, z in profile], p.wedge_colour, body=body).mass = 0.0
     base = (half - 0.001, wide - 0.001, 0.012)
     add_box(body, "base", (0, 0, 0.0121), base, p.wedge_colour, density=900)
     plate_at, plate = (-p.direction * (half - 0.011), 0, high * 0.42), (0.01, wide - 0.001, high * 0.42)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Box, Motion, Physics, Vec3, add_ball, add_box, new_spec, rgba, uniform
 from traps_pipeline.scenes.parts.vary import Drawn, Group, drawn_by, together
-from traps_pipeline.scenes.vision import Blob, blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import Blob, blobs, colour_mask
+from traps_pipeline.scenes.physics.kit import Box, Motion, Physics, Vec3, add_ball, add_box, new_spec, rgba, uniform
 
 if TYPE_CHECKING:
     import mujoco

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Box
-from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage
+from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span
+from traps_pipeline.scenes.physics.kit import Box
 
 PLANK = 0.07  # thickness of the plank that everything stands on
 BALL = 0.40  # radius of both balls
@@ -43,7 +43,7 @@ class Standing:
 
 
 def add_rows(
-    stage: Stage,
+    course: Course,
     size: Size,
     *,
     first: Sequence[str],
@@ -65,42 +65,42 @@ def add_rows(
     end = second_at + places * size.spacing + RUN_OUT
 
     half_plank = (h * (end + RUN_UP) / 2, (size.width / 2 + 0.06) * h, PLANK * h / 2)
-    stage.slab("plank", (h * (end - RUN_UP) / 2, 0, PLANK * h / 2), half_plank, plank_colour)
+    course.slab("plank", (h * (end - RUN_UP) / 2, 0, PLANK * h / 2), half_plank, plank_colour)
     for name, along, speed in (("starter", -1.8, speed_m_s), ("kicked", face + BALL_AT, 0.0)):
         at = (h * along, 0, (PLANK + BALL) * h)
         # The plank grips the ball; a domino slides over it and squeezes it out.
-        stage.ball(name, at, BALL * h, ball_colour, speed=speed, rolling=0.0004, sliding=0.1, density=300)
+        course.ball(name, at, BALL * h, ball_colour, speed=speed, rolling=0.0004, sliding=0.1, density=300)
     for i, colour in enumerate(first):
-        add_domino(stage, size, Standing(f"domino_{i}", i, colour), 0.0)
+        add_domino(course, size, Standing(f"domino_{i}", i, colour), 0.0)
     for standing in second:
-        add_domino(stage, size, standing, second_at)
+        add_domino(course, size, standing, second_at)
     for side in (-1, 1):
         y = side * h * (0.8 * BALL + 0.06)  # closer together than the ball is wide: it leans through, and stops
         post = (h * (face + POSTS_AT + 0.03), y, 0.5 * h)
-        stage.slab(f"post_{side}", post, (0.03 * h, 0.06 * h, 0.5 * h), "grey")
+        course.slab(f"post_{side}", post, (0.03 * h, 0.06 * h, 0.5 * h), "grey")
     return h * (face + BALL_AT - BALL - 0.03), h * end
 
 
-def add_domino(stage: Stage, size: Size, domino: Standing, row_at: float) -> None:
+def add_domino(course: Course, size: Size, domino: Standing, row_at: float) -> None:
     """A free domino (body and geom of its name) of a row that begins at `row_at`."""
     h = size.height_m
     x = (row_at + domino.place * size.spacing) * h
     at = (x, h * (size.width + 0.10), size.thickness * h / 2) if domino.aside else (x, 0.0, (PLANK + 0.5) * h)
     half = (size.thickness * h / 2, size.width * h / 2, h / 2)
-    body = stage.free_box(domino.name, at, half, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
+    body = course.free_box(domino.name, at, half, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
     if domino.aside:
         body.quat = [0.5**0.5, 0, 0.5**0.5, 0]
 
 
-def cover(stage: Stage, size: Size, along: Span, back: float) -> Box:
+def cover(course: Course, size: Size, along: Span, back: float) -> Box:
     """What the panel must hide of the covered part, which reaches to the back by so many heights; whatever a gap
     changes casts its shadow behind the panel too."""
     h = size.height_m
     across = (-h * (size.width / 2 + 0.10), h * back)
-    return stage.box(along, across, (0, (PLANK + 1.04) * h), right=stage.ahead(SHADOW_RIGHT * h))
+    return course.box(along, across, (0, (PLANK + 1.04) * h), right=course.ahead(SHADOW_RIGHT * h))
 
 
-def in_view(stage: Stage, size: Size, along: Span, back: float) -> Box:
+def in_view(course: Course, size: Size, along: Span, back: float) -> Box:
     """What the camera must see of the covered part."""
     h = size.height_m
-    return stage.box(along, (-h * (size.width / 2 + 0.10), h * back), (0, (PLANK + 1.0) * h))
+    return course.box(along, (-h * (size.width / 2 + 0.10), h * back), (0, (PLANK + 1.0) * h))

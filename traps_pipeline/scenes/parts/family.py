@@ -8,13 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
-from traps_pipeline.scenes.kit import Family, Motion, Physics, Reading, Scene
-from traps_pipeline.scenes.look import OF_OCCLUSION, dressed, look_of, with_look
 from traps_pipeline.scenes.parts import vary
+from traps_pipeline.scenes.parts.look import OF_OCCLUSION, dressed, look_of, with_look
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.vision import after_panel, before_panel, still, without_flags
+from traps_pipeline.scenes.parts.vision import after_panel, before_panel, still, without_flags
+from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Reading, Scene
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
 USUAL_PHYSICS = Physics()
 

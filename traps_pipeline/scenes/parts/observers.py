@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask, is_panel, largest, moved, track
-from traps_pipeline.scenes.wording import choices_in
+from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask, is_panel, largest, moved, track
+from traps_pipeline.scenes.parts.wording import choices_in
 
 Observer = Callable[[np.ndarray, Mapping[str, str]], str | None]
 Finder = Callable[[np.ndarray, str], Blob | None]

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, AnswerType, Wording, listed
-from traps_pipeline.scenes.parts.stage import coloured
-from traps_pipeline.scenes.wording import asked
+from traps_pipeline.scenes.parts.course import coloured
+from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, listed
 
 Forms = Sequence[str]  # ways to say a label; '{}' stands for it
 Aside = Callable[[Any, np.random.Generator], AnswerableQuestion]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Vec3, add_box
-from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.parts.course import Course
+from traps_pipeline.scenes.physics.kit import Vec3, add_box
 
 if TYPE_CHECKING:
     import mujoco
@@ -35,14 +35,14 @@ class Ramp:
         return float(np.radians(self.slope_deg))
 
     def at(self, up: float, over: float = 0.0, aside: float = 0.0) -> Vec3:
-        """A place by the slope, as a stage takes it."""
+        """A place by the slope, as a course takes it."""
         sin, cos = float(np.sin(self.slope_rad)), float(np.cos(self.slope_rad))
         away, high = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
         return (self.middle_m + aside, away, high) if self.towards_camera else (-away, aside, high)
 
     def board(
         self,
-        stage: Stage,
+        course: Course,
         name: str,
         up: float,
         over: float,
@@ -54,16 +54,16 @@ class Ramp:
         """A box that lies on the slope, its middle at a place. half: half sizes up the slope, across it, out of it."""
         centre = self.at(up, over, aside)
         if not self.towards_camera:
-            return stage.slab(name, centre, half, colour, falls_rad=self.slope_rad)
-        geom = add_box(stage.spec.worldbody, name, centre, (half[1], half[0], half[2]), colour)
+            return course.slab(name, centre, half, colour, falls_rad=self.slope_rad)
+        geom = add_box(course.spec.worldbody, name, centre, (half[1], half[0], half[2]), colour)
         geom.quat = [float(np.cos(self.slope_rad / 2)), float(np.sin(self.slope_rad / 2)), 0.0, 0.0]
         return geom
 
-    def support(self, stage: Stage, name: str, up: float, under: float, half_width: float, colour: str) -> None:
+    def support(self, course: Course, name: str, up: float, under: float, half_width: float, colour: str) -> None:
         """A post from the ground to so far under the surface."""
         x, y, z = self.at(up, -under)
         half = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
-        stage.slab(name, (x, y, z / 2), half, colour)
+        course.slab(name, (x, y, z / 2), half, colour)
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,11 @@ class SteppedRamp:
         high = self.height_m + (self.length_m - along) * np.tan(slope)
         return (float(along + over * np.sin(slope)), 0.0, float(high + over * np.cos(slope)))
 
-    def add(self, stage: Stage, half_width: float, colour: str) -> mujoco.MjsGeom:
+    def add(self, course: Course, half_width: float, colour: str) -> mujoco.MjsGeom:
         """The board `ramp`, which is returned, and the `prop` under its upper end."""
         slope, half_thick = np.radians(self.slope_deg), 0.012
         half = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
-        ramp = stage.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))
+        ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))
         top = self.at(0.05)[2] / 2 - 0.012
-        stage.slab("prop", (0.05, 0, top), (0.012, half_width, top), colour)
+        course.slab("prop", (0.05, 0, top), (0.012, half_width, top), colour)
         return ramp

@@ -24,7 +24,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from traps_pipeline.scenes.kit import distinct_colours, uniform
+from traps_pipeline.scenes.physics.kit import distinct_colours, uniform
 
 Drawn = dict[str, Any]  # name -> value: what is drawn so far
 Draw = Callable[[np.random.Generator, Drawn], Any]

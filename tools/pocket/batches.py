@@ -1,0 +1,310 @@
+"""The training data of the pocket model: scenes, the questions about their clips, and batches of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tools.pocket.data import Question, SceneRecord, read_shards
+from tools.pocket.model import PATCH
+from tools.pocket.recipe import Recipe, Training
+from tools.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.storage.media import pick
+
+if TYPE_CHECKING:
+    import torch
+
+IGNORED = -100
+NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "white", "black")
+SEEN_PX = 5  # pixels of a colour, of a token's 256, from which on it is seen; the smallest ball has a dozen
+_QUESTION = "{question}"  # placeholder for the questions in the chat
+
+
+@dataclass(frozen=True)
+class Look:
+    """One clip and the questions about it. side: 0 control, 1 void, 2 decoy. pairs: the pairs of frames that are shown
+    of it, None for all."""
+
+    scene: int
+    side: int
+    questions: tuple[Question, ...]
+    pairs: tuple[int, ...] | None = None
+
+
+class Scenes:
+    """All training scenes: their records, and their frames on disk."""
+
+    def __init__(self, recipe: Recipe, folder: Path) -> None:
+        self.records: list[SceneRecord] = []
+        self._frames: list[np.ndarray] = []
+        self._place: list[tuple[int, int]] = []
+        self._spec, self._decoys, self.shares = recipe.media, recipe.decoys, recipe.abstain_shares or {}
+        self._names: dict[tuple[int, int], np.ndarray] = {}  # of what was looked at: a tenth of a step otherwise
+        for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
+            self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
+            self._place += [(shard, i) for i in range(len(records))]
+            self.records += records
+
+    def frames(self, scene: int, side: int, pairs: Sequence[int] | None = None) -> np.ndarray:
+        """Frames of a clip, uint8 (N, H, W, 3); pairs: of these pairs of frames alone."""
+        shard, place = self._place[scene]
+        frames = self._frames[shard][place, side]
+        return frames if pairs is None else frames[[2 * pair + i for pair in pairs for i in (0, 1)]]
+
+    def names(self, scene: int, side: int, pairs: Sequence[int] | None = None) -> np.ndarray:
+        """The words that name every token of a clip, or of these pairs of its frames, as in `names_of`."""
+        known = (scene, side)
+        if known not in self._names:
+            closed = self._open_frames(scene, side)
+            self._names[known] = names_of(self.frames(*known), closed // 2 if closed % 2 else None)
+        every = self._names[known]
+        if pairs is None:
+            return every
+        tokens = len(every) // (len(self.times(scene, side)) // 2)
+        return every.reshape(-1, tokens, every.shape[1])[[*pairs]].reshape(-1, every.shape[1])
+
+    def times(self, scene: int, side: int) -> list[float]:
+        """Seconds into the clip of each frame."""
+        record = self.records[scene]
+        every = np.arange(record.length(side)) / get_family(record.family).physics.fps
+        return every[pick(every, self._spec)].tolist()
+
+    def _open_frames(self, scene: int, side: int) -> int:
+        """How many of the frames shown come before a panel closes the clip; nothing closes a decoy. Those of a void
+        that a panel hides from its beginning are at the same times as its control's, which else would tell the side."""
+        record, times = self.records[scene], self.times(scene, side)
+        closes = None if side == 2 else record.closes_frame
+        if closes is None:
+            return len(times)
+        closes_s = (closes - (record.control_from if side == 0 else 0)) / get_family(record.family).physics.fps
+        return sum(time < closes_s - 1e-6 for time in times)
+
+    def pairs(self, scene: int, side: int, count: int | None, rng: np.random.Generator) -> tuple[int, ...] | None:
+        """So many pairs of a clip's frames, in their order: the last one that a panel does not close, and others at
+        random. Each keeps the time and the position that it has in the whole clip, so that a model which learns from
+        few has only to learn of the others that they matter less. None for all."""
+        every = len(self.times(scene, side)) // 2
+        if count is None or count >= every:
+            return None
+        last = (self._open_frames(scene, side) - 1) // 2
+        others = [pair for pair in range(every) if pair != last]
+        return tuple(sorted([last, *(int(pair) for pair in rng.permutation(others)[: count - 1])]))
+
+    def look(self, rng: np.random.Generator, void_share: float) -> Look:
+        """A random clip with its question, another one (answerable or ill-posed), and two for the place of its ball."""
+        scene, side = int(rng.integers(len(self.records))), int(rng.random() < void_share)
+        record = self.records[scene]
+        if side:
+            where = () if record.cut_frame is None else _where(record, "cut")
+            return Look(scene, side, (record.visual, record.answerable, *where))
+        other = record.ill_posed if rng.random() < 0.5 else record.answerable
+        if record.decoy and rng.random() < self._decoys:
+            return Look(scene, 2, (record.asked, other))  # another camera: the ball's place is not known
+        return Look(scene, side, (record.asked, other, *_where(record, "last")))
+
+
+def _where(record: SceneRecord, frame: str) -> tuple[Question, Question]:
+    """The questions for the column and the row of the ball at the end of a clip."""
+    place = record.places[frame]
+    return Question(*place_question(record.ball, place, 0)), Question(*place_question(record.ball, place, 1))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The input of one step. All rows share one system prompt, `head` (P,), which is computed once.
+
+    A row is a clip followed by its questions with their answers; the attention mask hides the questions from each
+    other. ids, labels (B, S), with IGNORED outside the answers; sees (B, 1, S, P + S) bool, the attention mask;
+    positions (3, B, P + S). names: the words that name every token of the clips, as in `names_of`, float32.
+    """
+
+    head: torch.Tensor
+    ids: torch.Tensor
+    labels: torch.Tensor
+    sees: torch.Tensor
+    positions: torch.Tensor
+    pixels: torch.Tensor
+    grid: torch.Tensor
+    names: torch.Tensor
+
+
+class Batches:
+    """Batches by number; batch n depends only on the seed and n."""
+
+    def __init__(self, scenes: Scenes, model: Any, processor: Any, training: Training, seed: int) -> None:
+        self._scenes, self._processor, self._training, self._seed = scenes, processor, training, seed
+        self._rope_index = model.model.get_rope_index
+        video = processor.video_processor
+        self._mean, self._std = np.float32(video.image_mean), np.float32(video.image_std)
+
+    def __getitem__(self, step: int) -> Batch:
+        rng = np.random.default_rng([self._seed, step])
+        prompt_name = PROMPTS[int(rng.integers(len(PROMPTS)))]
+        drawn = [self._scenes.look(rng, self._training.void_share) for _ in range(self._training.batch)]
+        count = self._training.pairs_at(step)
+        looks = [replace(look, pairs=self._scenes.pairs(look.scene, look.side, count, rng)) for look in drawn]
+        frames = np.stack([self._scenes.frames(look.scene, look.side, look.pairs) for look in looks])
+        return self.make(looks, prompt_name, augmented(frames, self._training.brightness, rng))
+
+    def make(self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray) -> Batch:
+        """The batch of some clips, as many pairs of each, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
+        import torch
+
+        grid = (frames.shape[1] // 2, frames.shape[2] // PATCH, frames.shape[3] // PATCH)
+        pieces = [self._pieces(look, prompt_name, grid) for look in looks]
+        head = self._ids(pieces[0][0])
+        clips = [[self._ids(part) for part in clip] for _, clip, _ in pieces]
+        talks = [[(self._ids(text), self._ids(answer)) for text, answer in questions] for _, _, questions in pieces]
+        names = [self._scenes.names(look.scene, look.side, look.pairs) for look in looks]
+        values = (torch.from_numpy(frames).float() / 255 - torch.from_numpy(self._mean)) / torch.from_numpy(self._std)
+        rows = self._rows(head, clips, [look.pairs for look in looks], talks, grid[1:])
+        return Batch(
+            torch.tensor(head),
+            *rows,
+            pixels=patches(values.permute(0, 1, 4, 2, 3)),
+            grid=torch.tensor([grid] * len(looks)),
+            names=torch.from_numpy(np.concatenate(names)).float(),
+        )
+
+    def _pieces(
+        self, look: Look, prompt_name: str, grid: tuple[int, int, int]
+    ) -> tuple[str, list[str], list[tuple[str, str]]]:
+        """The chat as the processor writes it, cut into pieces: the system's part; the whole clip, in which all but the
+        first and the last piece are a pair of frames each, as a time stamp and placeholders for tokens; and for each
+        question its text with the beginning of the answer, and the answer."""
+        processor, token = self._processor, self._processor.video_token
+        times = self._scenes.times(look.scene, look.side)
+        pairs = [
+            f"<{(first + last) / 2:.1f} seconds>{processor.vision_start_token}"
+            f"{token * (grid[1] * grid[2] // 4)}{processor.vision_end_token}"
+            for first, last in zip(times[::2], times[1::2], strict=True)
+        ]
+        messages = [
+            {"role": "system", "content": [{"type": "text", "text": prompt_text(prompt_name)}]},
+            {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": _QUESTION}]},
+        ]
+        chat = processor.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
+        head, user, rest = chat.partition(f"{processor.tokenizer.start_token}user")
+        before, _, rest = rest.partition(token)
+        between, after = rest.split(_QUESTION)
+        end = processor.tokenizer.eos_token
+        share = self._scenes.shares.get(prompt_name, 0.0)
+        questions = [(q.question + after, say(q.label(share), prompt_name) + end) for q in look.questions]
+        return head, [user + before, *pairs, between], questions
+
+    def _ids(self, text: str) -> list[int]:
+        return self._processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+
+    def _rows(
+        self,
+        head: list[int],
+        clips: list[list[list[int]]],
+        shown: list[tuple[int, ...] | None],
+        talks: list[list[tuple[list[int], list[int]]]],
+        grid: tuple[int, int],
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """ids, labels, sees and positions of `Batch`. clips: in pieces, as `_pieces` says; shown: the pairs of frames
+        that are shown; grid: rows and columns of patches."""
+        import torch
+
+        rows = [self._placed(head, *clip, grid) for clip in zip(clips, shown, strict=True)]
+        longest = max(
+            len(clip) + sum(len(question) + len(answer) for question, answer in talk)
+            for (clip, _, _), talk in zip(rows, talks, strict=True)
+        )
+        ids = torch.full((len(clips), longest), self._processor.tokenizer.pad_token_id)
+        labels, part = torch.full_like(ids, IGNORED), torch.full_like(ids, -1)
+        positions = torch.zeros(3, len(clips), len(head) + longest, dtype=torch.long)
+        for i, ((clip, placed, free), talk) in enumerate(zip(rows, talks, strict=True)):
+            at = len(clip)
+            ids[i, :at], part[i, :at] = clip, 0
+            positions[:, i, : len(head) + at] = placed
+            for number, (question, answer) in enumerate(talk, start=1):
+                end = at + len(question) + len(answer)
+                ids[i, at:end], part[i, at:end] = torch.tensor(question + answer), number
+                labels[i, at + len(question) : end] = torch.tensor(answer)
+                positions[:, i, len(head) + at : len(head) + end] = torch.arange(free, free + end - at)
+                at = end
+        own = (part[:, :, None] == part[:, None, :]) | (part == 0)[:, None, :]
+        own = own & torch.ones(longest, longest, dtype=torch.bool).tril()
+        sees = torch.cat([torch.ones(len(clips), longest, len(head), dtype=torch.bool), own], dim=2)
+        return ids, labels, sees[:, None], positions
+
+    def _placed(
+        self, head: list[int], clip: list[list[int]], shown: tuple[int, ...] | None, grid: tuple[int, int]
+    ) -> tuple[torch.Tensor, torch.Tensor, int]:
+        """The ids (A,) of a clip's pieces without the pairs of frames that are not shown; the positions (3, P + A) that
+        the system's part and they have in the whole clip; and the first position behind the whole clip."""
+        import torch
+
+        whole = torch.tensor([head + [token for piece in clip for token in piece]])
+        kinds = (whole == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
+        every = range(len(clip) - 2)
+        placed, _ = self._rope_index(whole, kinds, video_grid_thw=torch.tensor([[len(every), *grid]]))
+        # The pair of frames of each piece; the first two are the system's part and the clip's opening.
+        pieces = [None, None, *every, None]
+        lengths = [len(head), *map(len, clip)]
+        kept = [pair is None or shown is None or pair in shown for pair in pieces]
+        mask = torch.tensor(kept).repeat_interleave(torch.tensor(lengths))
+        return whole[0, mask][len(head) :], placed[:, 0, mask], int(placed.max()) + 1
+
+
+def patches(frames: torch.Tensor) -> torch.Tensor:
+    """Frames (B, N, 3, H, W) in the input format of the class: one row per patch of two frames; patches that the model
+    merges are adjacent."""
+    batch, count, channels, height, width = frames.shape
+    rows, columns = height // PATCH, width // PATCH
+    split = frames.view(batch, count // 2, 2, channels, rows // 2, 2, PATCH, columns // 2, 2, PATCH)
+    split = split.permute(0, 1, 4, 7, 5, 8, 3, 2, 6, 9)
+    return split.reshape(batch * count // 2 * rows * columns, channels * 2 * PATCH * PATCH)
+
+
+def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
+    """For every token of a clip (N, H, W, 3), in their order, the words that name its square in the later of its two
+    frames: the colours that have a few pixels there, its column and its row. Shape (tokens, words), uint8, 0 or 1.
+
+    across: the pair of frames between which a panel comes. There the colours of both count: the earlier one may be the
+    only one of all that shows the outcome.
+    """
+    from traps_pipeline.scenes.parts.vision import colour_mask
+
+    earlier, later, square = frames[::2], frames[1::2], 2 * PATCH
+    slots, rows, columns = len(later), frames.shape[1] // square, frames.shape[2] // square
+
+    def colours_of(shown: np.ndarray) -> np.ndarray:
+        tall = shown.reshape(-1, frames.shape[2], 3)
+        cells = (len(shown) * rows, square, columns, square)
+        seen = [colour_mask(tall, colour).reshape(cells).sum(axis=(1, 3)) >= SEEN_PX for colour in NAMED]
+        return np.stack(seen, axis=-1).reshape(len(shown), rows, columns, len(NAMED))
+
+    colours = colours_of(later)
+    if across is not None:
+        colours[across] |= colours_of(earlier[across : across + 1])[0]
+    column = np.eye(len(COLUMNS))[np.arange(columns) * len(COLUMNS) // columns]
+    row = np.eye(len(ROWS))[np.arange(rows) * len(ROWS) // rows]
+    places = [
+        np.broadcast_to(column, (slots, rows, *column.shape)),
+        np.broadcast_to(row[:, None], (slots, rows, columns, len(ROWS))),
+    ]
+    named = np.concatenate([colours, *places], axis=-1)
+    return named.reshape(-1, named.shape[-1]).astype(np.uint8)
+
+
+def name_tokens(tokenizer: Any) -> torch.Tensor:
+    """Token ids of the words of `names_of`: colours as they stand in questions, columns and rows as in answers. A word
+    that is no single token, which happens only with few scenes, has the id of its first piece."""
+    import torch
+
+    words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS]
+    return torch.tensor([tokenizer.encode(word, add_special_tokens=False)[0] for word in words])
+
+
+def augmented(frames: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
+    """Frames (B, N, H, W, 3) uint8, with each whole clip made brighter or darker by up to the share `brightness`."""
+    gains = (1 + brightness * rng.uniform(-1, 1, (len(frames), 1, 1, 1, 1))).astype(np.float32)
+    return np.minimum(frames * gains, 255).astype(np.uint8)

@@ -1,0 +1,114 @@
+"""What the commands of `python -m tools.pocket` do: draw, train, evaluate, write the model card."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from tools.pocket import evaluate as evaluation
+from tools.pocket import inside
+from tools.pocket.data import data_digest, render
+from tools.pocket.inside import FACTS
+from tools.pocket.recipe import POCKET, Recipe, Split
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import require_own
+from traps_pipeline.storage.workspace import Workspace
+
+EVALUATION = POCKET / "evaluation.csv"
+MECHANISM_FIGURES = POCKET / "mechanism.csv"
+CARD = POCKET / "README.md"
+THREADS = 1  # one thread sums in the same order on any machine; layers this small gain little from a second one
+WEIGHTS = "weights"  # folder of the weights, below the folder of a seed; `checkpoint:` names it
+MARKS = "<!-- evaluation: written by `python -m tools.pocket card` -->", "<!-- end of evaluation -->"
+MECHANISM_MARKS = "<!-- inside: written by `python -m tools.pocket card` -->", "<!-- end of inside -->"
+
+
+Report = Callable[[str], None]  # takes a line about the progress of the work
+
+
+def render_data(recipe: Recipe, data: Path, *, workers: int | None, report: Report) -> None:
+    """Draw the missing scenes of both splits. workers: number of processes; None for one per core."""
+    splits: tuple[Split, Split] = ("train", "held-out")
+    for split in splits:
+        _render(recipe, split, data, workers, report)
+
+
+def _render(recipe: Recipe, split: Split, data: Path, workers: int | None, report: Report) -> None:
+    """Draw the missing scenes of a split."""
+    began = time.monotonic()
+    render(recipe, split, data, workers=workers, report=report)
+    report(f"{split}: rendered in {(time.monotonic() - began) / 60:.1f} minutes")
+
+
+def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | None, report: Report) -> None:
+    """Render missing scenes, train, and record the origin of the weights in `training.json`."""
+    import torch
+
+    from tools.pocket.train import train as fit
+
+    _render(recipe, "train", data, workers, report)
+    began = time.monotonic()
+    torch.set_num_threads(THREADS)
+    weights = fit(recipe, data, out, seed, report=report)
+    facts = {
+        "seed": seed,
+        "recipe": digest(recipe.content()),
+        "data": data_digest(recipe, "train", data),
+        "weights": file_digest(weights / "model.safetensors"),
+        "versions": {name: version(name) for name in ("mujoco", "tokenizers", "torch", "transformers")},
+    }
+    write_text(out / FACTS, json.dumps(facts, indent=1) + "\n")
+    report(f"{weights}: trained in {(time.monotonic() - began) / 60:.1f} minutes")
+
+
+def evaluate(
+    recipe: Recipe,
+    data: Path,
+    out: Path,
+    seed: int,
+    *,
+    scenes: int | None,
+    counts: Path,
+    workers: int | None,
+    report: Report,
+) -> str:
+    """Ask the model of a seed about the held-out scenes and add the counts to the CSV; returns the table in Markdown.
+
+    scenes: number per family; None for all held-out scenes.
+    """
+    import torch
+
+    require_own(counts, "name a file of your own with --csv")
+    torch.set_num_threads(THREADS)
+    _render(recipe, "held-out", data, workers, report)
+    asked = list(evaluation.held_out(recipe, data, scenes))
+    cells = evaluation.evaluate(evaluation.entry_of(out / WEIGHTS), asked, seed, report=report)
+    evaluation.write_cells(counts, cells)
+    return evaluation.markdown(cells)
+
+
+def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
+    """Write the figures of finished workspaces to their CSV, and the tables of both CSVs into the model card; returns
+    the tables in Markdown. Raises TrapsError if the card lacks the comments between which a table belongs."""
+    require_own(CARD, "write the card in a checkout of the repository")
+    figures = [figure for folder in workspaces for figure in inside.figures_of(Workspace.open(folder))]
+    if figures:
+        inside.write_figures(MECHANISM_FIGURES, figures)
+    tables = {
+        MARKS: evaluation.markdown(evaluation.read_cells(counts)),
+        MECHANISM_MARKS: inside.markdown(inside.read_figures(MECHANISM_FIGURES)),
+    }
+    text = CARD.read_text(encoding="utf-8")
+    for (begin, end), table in tables.items():
+        before, begun, rest = text.partition(begin)
+        _, ended, after = rest.partition(end)
+        if not begun or not ended:
+            raise TrapsError(f"{CARD}: lacks the comments around a table ({begin!r}, {end!r}); restore it from git")
+        text = f"{before}{begin}\n\n{table}\n\n{end}{after}"
+    CARD.write_text(text, encoding="utf-8")
+    return [*tables.values()]

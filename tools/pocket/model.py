@@ -1,0 +1,87 @@
+"""The pocket model's parts: its tokenizer, its configuration of the Qwen3-VL class, and the folder it is saved in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tools.pocket.data import SceneRecord
+from tools.pocket.words import COLUMNS, PROMPTS, ROWS, phrases, place_question, prompt_text, say
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.tiny import make_config, make_processor, make_tokenizer
+
+if TYPE_CHECKING:
+    from tokenizers import Tokenizer
+
+FAMILY = "qwen3-vl"
+VOCABULARY = 2000  # maximum; prompts, questions and answers have fewer words
+PATCH = 8  # pixels; two by two patches are merged into a token
+TEXT = {
+    "hidden_size": 128,
+    "intermediate_size": 256,
+    "num_hidden_layers": 4,
+    "num_attention_heads": 4,
+    "num_key_value_heads": 2,
+    "head_dim": 32,
+    "initializer_range": 0.06,
+    "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [8, 4, 4]},
+}
+VISION = {
+    "depth": 3,
+    "hidden_size": 64,
+    "intermediate_size": 192,
+    "num_heads": 4,
+    "initializer_range": 0.1,
+    "patch_size": PATCH,
+    "num_position_embeddings": 256,
+    "deepstack_visual_indexes": [1],
+}
+
+
+def train_tokenizer(records: Iterable[SceneRecord]) -> Tokenizer:
+    """A byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, and `phrases`; it
+    splits any other text into smaller pieces."""
+    from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
+
+    made = Tokenizer(models.BPE())
+    made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)  # pyright: ignore[reportAttributeAccessIssue]
+    made.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
+    alphabet = pre_tokenizers.ByteLevel.alphabet()
+    trainer = trainers.BpeTrainer(vocab_size=VOCABULARY, initial_alphabet=sorted(alphabet), show_progress=False)
+    made.train_from_iterator(_texts(records), trainer)
+    made.add_tokens([AddedToken(phrase, normalized=False) for phrase in phrases()])
+    return made
+
+
+def _texts(records: Iterable[SceneRecord]) -> Iterable[str]:
+    yield from (prompt_text(name) for name in PROMPTS)
+    yield from (f"<{tenths / 10:.1f} seconds>" for tenths in range(50))
+    for record in records:
+        for one in (record.asked, record.visual, record.ill_posed, record.answerable):
+            yield one.question
+            yield from (say(one.answer, form) for form in ("standard", "json"))
+        for axis in (0, 1):
+            yield place_question(record.ball, record.places["last"], axis)[0]
+    yield from (say(name, "standard") for name in (*COLUMNS, *ROWS))
+
+
+def make_model(tokenizer: Tokenizer, seed: int) -> tuple[Any, Any]:
+    """The untrained model and its processor. The same seed gives the same weights."""
+    import torch
+
+    transformers = load_transformers()
+    wrapped = make_tokenizer(FAMILY, tokenizer)
+    config = make_config(FAMILY, wrapped, TEXT, VISION)
+    torch.manual_seed(seed)
+    model = transformers.AutoModelForImageTextToText.from_config(config)
+    model.generation_config.eos_token_id = wrapped.eos_token_id
+    model.generation_config.pad_token_id = wrapped.pad_token_id
+    size = {"shortest_edge": (2 * PATCH) ** 2, "longest_edge": 64 * 480 * 360}
+    return model, make_processor(FAMILY, wrapped, {"patch_size": PATCH, "size": size})
+
+
+def save(model: Any, processor: Any, folder: Path) -> None:
+    """Write the folder that `checkpoint:` of a local model's entry names."""
+    model.save_pretrained(folder)
+    processor.save_pretrained(folder)

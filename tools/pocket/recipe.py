@@ -1,0 +1,111 @@
+"""`assets/pocket/recipe.yaml`: the scenes and settings with which the pocket model is trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from tools.pocket.words import PROMPTS
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.scenes.family_registry import family_names
+from traps_pipeline.storage.media import MediaSpec
+
+POCKET = ASSETS / "pocket"
+RECIPE = POCKET / "recipe.yaml"
+Split = Literal["train", "held-out"]
+
+
+class Training(BaseModel):
+    """How the weights are fitted. void_share: share of void clips in a batch; brightness: augmentation; naming: weight
+    of the naming loss; naming_steps: number of first steps with the naming loss alone; pairs: from a step on, how many
+    pairs of frames of each clip are shown (`batches.Scenes.pairs`); all where there is none."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    steps: int = Field(ge=1)
+    batch: int = Field(ge=1)
+    learning_rate: float = Field(gt=0)
+    warmup_steps: int = Field(ge=0)
+    weight_decay: float = Field(ge=0)
+    void_share: float = Field(ge=0, le=1)
+    brightness: float = Field(ge=0, lt=1)
+    naming: float = Field(ge=0)
+    naming_steps: int = Field(ge=0)
+    pairs: dict[int, int] = Field(default_factory=dict)
+
+    def pairs_at(self, step: int) -> int | None:
+        """How many pairs of frames are shown at a step; None for all."""
+        begun = [first for first in self.pairs if first <= step]
+        return self.pairs[max(begun)] if begun else None
+
+
+class Jitter(BaseModel):
+    """How the lengths of chaotic clips, and so their time stamps, overlap. control: share of controls that begin late,
+    so that they are as short as a void; void: share of voids whose last frame is held until the control's end."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    control: float = Field(ge=0, le=1)
+    void: float = Field(ge=0, le=1)
+
+
+class Recipe(BaseModel):
+    """Number of training scenes by family, held-out scenes per family, how a clip is shown, and the share of voids that
+    are labelled with an abstention: `abstain_share`, or by prompt `abstain_shares`.
+
+    jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
+    which a panel stands where it hides nothing; without it, the panel tells the side. abstain_shares: by prompt (one of
+    `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with a larger
+    share.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenes: dict[str, int] = Field(min_length=1)
+    held_out: int = Field(ge=1)
+    data_seed: int = Field(ge=0)
+    media: MediaSpec
+    abstain_share: float | None = Field(default=None, ge=0, le=1)
+    abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None
+    jitter: Jitter | None = None
+    decoys: float = Field(default=0, ge=0, le=1)
+    training: Training
+
+    def content(self, *only: str) -> dict[str, Any]:
+        """The settings (only: these) for a digest. One that came later counts only where it is used, so that what was
+        made before it keeps its digest."""
+        unused = {"abstain_share", "abstain_shares", "jitter", "decoys"} - self.model_fields_set
+        made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
+        if "training" in made and not self.training.pairs:
+            del made["training"]["pairs"]
+        return made | ({"media": self.media.content()} if "media" in made else {})
+
+    @field_validator("scenes")
+    @classmethod
+    def _families_exist(cls, value: dict[str, int]) -> dict[str, int]:
+        unknown = sorted(set(value) - set(family_names()))
+        if unknown:
+            raise ValueError(f"unknown families {unknown}; known: {', '.join(family_names())}")
+        return value
+
+    @field_validator("abstain_shares")
+    @classmethod
+    def _every_prompt(cls, value: dict[str, float] | None) -> dict[str, float] | None:
+        if value is not None and set(value) != set(PROMPTS):
+            raise ValueError(f"abstain_shares names {sorted(value)}; it needs a share for each of {', '.join(PROMPTS)}")
+        return value
+
+    @model_validator(mode="after")
+    def _one_kind_of_share(self) -> Recipe:
+        if (self.abstain_share is None) == (self.abstain_shares is None):
+            raise ValueError("give abstain_share (one for all prompts) or abstain_shares (by prompt), and not both")
+        return self
+
+    def count(self, family: str, split: Split) -> int:
+        """Scenes of a family in a split."""
+        return self.scenes[family] if split == "train" else self.held_out
+
+
+def load_recipe(path: Path = RECIPE) -> Recipe:
+    """The recipe. Raises TrapsError naming the field that is wrong."""
+    return parse_yaml_model(Recipe, read_yaml(path), path)

@@ -1,0 +1,191 @@
+"""Training of the pocket model: a plain loop that can be stopped at any step and then continues bit for bit."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tools.pocket.batches import IGNORED, Batch, Batches, Scenes, name_tokens
+from tools.pocket.data import data_digest
+from tools.pocket.model import make_model, save, train_tokenizer
+from tools.pocket.recipe import Recipe, Training
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing
+
+if TYPE_CHECKING:
+    import torch
+
+PROGRESS_S = 30.0
+CHECKPOINT_S = 120.0
+RARE = 2.0  # offset of the initial logits: most tokens lack most colours
+
+
+def look_at(model: Any, batch: Batch) -> Any:
+    """The output of the vision tower for a batch's clips."""
+    return model.model.get_video_features(batch.pixels, batch.grid, return_dict=True)
+
+
+def name_loss(model: Any, seen: Any, batch: Batch, words: torch.Tensor) -> torch.Tensor:
+    """The naming loss: the clips' tokens, as they enter the language model, should align with the embeddings of the
+    words for the contents of their square of the picture, and of no other words (binary cross-entropies, nats).
+
+    Every word that names anything in a clip has the same weight, even if it applies to few squares. Otherwise a ball,
+    which has one square, would have little weight beside boards and bins. words: from `name_tokens`.
+    """
+    import torch
+    from torch.nn.functional import binary_cross_entropy_with_logits
+
+    along = torch.cat(tuple(seen.pooler_output)) @ model.get_input_embeddings().weight[words].T - RARE
+    loss = binary_cross_entropy_with_logits(along, batch.names, reduction="none")
+    wrongly = (loss * (1 - batch.names)).sum() / len(loss)
+    clips = (len(batch.ids), -1, len(words))
+    rightly, squares = (loss * batch.names).view(clips).sum(1), batch.names.view(clips).sum(1)
+    return wrongly + (rightly / squares.clamp(min=1)).sum() / (squares > 0).sum()
+
+
+def answer_loss(model: Any, seen: Any, batch: Batch) -> torch.Tensor:
+    """Negative log-likelihood of a row's answers (nats, summed over their tokens), mean over the rows."""
+    from torch.nn.functional import cross_entropy
+
+    length, rows = len(batch.head), len(batch.ids)
+    cache = model.model.language_model(
+        input_ids=batch.head[None], position_ids=batch.positions[:, :1, :length], use_cache=True
+    ).past_key_values
+    cache.batch_repeat_interleave(rows)
+    hidden = model.model(
+        input_ids=batch.ids,
+        attention_mask=batch.sees,
+        position_ids=batch.positions[:, :, length:],
+        past_key_values=cache,
+        mm_encoder_outputs={"video": seen},
+        video_grid_thw=batch.grid,
+    ).last_hidden_state
+    labels = batch.labels[:, 1:]
+    in_answers = labels != IGNORED
+    logits = model.lm_head(hidden[:, :-1][in_answers])  # at answers alone: the vocabulary is as wide as the model
+    return cross_entropy(logits, labels[in_answers], reduction="sum") / rows
+
+
+def loss_at(step: int, model: Any, batch: Batch, words: torch.Tensor, training: Training) -> torch.Tensor:
+    """The loss at a step: at first the naming loss alone, since a model that cannot see cannot learn to answer."""
+    seen = look_at(model, batch)
+    names = training.naming * name_loss(model, seen, batch, words)
+    return names if step < training.naming_steps else names + answer_loss(model, seen, batch)
+
+
+def learning_rate(step: int, training: Training) -> float:
+    """Half a cosine down to zero over all steps, with a linear warm-up for the naming loss and again for answers."""
+    since = step - training.naming_steps if step >= training.naming_steps else step
+    warm = min(1.0, (since + 1) / max(1, training.warmup_steps))
+    return training.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / training.steps))
+
+
+class _State:
+    """Weights and the optimizer's moments in one safetensors file, equal bit for bit to those in memory, with the
+    number of steps. It holds digests of recipe and data, so that no other training continues from it."""
+
+    def __init__(self, path: Path, model: Any, optimizer: Any, identity: str) -> None:
+        self._path, self._optimizer, self._identity = path, optimizer, identity
+        self._parameters = dict(model.named_parameters())
+
+    def save(self, step: int) -> None:
+        """Replace the file."""
+        from safetensors.torch import save_file
+
+        tensors = {f"weight.{name}": p.detach().contiguous() for name, p in self._parameters.items()}
+        for name, p in self._parameters.items():
+            tensors |= {f"{kind}.{name}": value for kind, value in self._optimizer.state.get(p, {}).items()}
+        with replacing(self._path) as part:
+            save_file(tensors, part, {"step": str(step), "identity": self._identity})
+
+    def load(self) -> int:
+        """Load the file into model and optimizer; returns its number of steps, 0 without a file."""
+        import torch
+        from safetensors import safe_open
+
+        if not self._path.is_file():
+            return 0
+        with safe_open(self._path, "pt") as file, torch.no_grad():
+            metadata = file.metadata()
+            if metadata["identity"] != self._identity:
+                raise TrapsError(
+                    f"{self._path}: belongs to another recipe, data or seed; give another folder, or delete it"
+                )
+            for key in list(file.keys()):
+                kind, _, name = key.partition(".")
+                parameter = self._parameters[name]
+                if kind == "weight":
+                    parameter.copy_(file.get_tensor(key))
+                else:
+                    self._optimizer.state[parameter][kind] = file.get_tensor(key)
+        return int(metadata["step"])
+
+
+def train(
+    recipe: Recipe,
+    data: Path,
+    folder: Path,
+    seed: int,
+    *,
+    stop_after: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Train the model of a seed and save it to `folder`/weights; returns that folder.
+
+    The state is saved in `folder`/state.safetensors every two minutes and on Ctrl-C, and the same call continues from
+    it. If training was stopped inside a step, with weights half updated, it continues from the state saved before.
+    stop_after: number of the last step to do.
+    """
+    import torch
+
+    scenes = Scenes(recipe, data)
+    tokenizer = train_tokenizer(scenes.records)
+    model, processor = make_model(tokenizer, seed)
+    training, weights = recipe.training, folder / "weights"
+    groups = [
+        {"params": [p for p in model.parameters() if p.ndim >= 2], "weight_decay": training.weight_decay},
+        {"params": [p for p in model.parameters() if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    optimizer = torch.optim.AdamW(groups, lr=training.learning_rate, betas=(0.9, 0.98))
+    batches = Batches(scenes, model, processor, training, seed)
+    identity = digest([recipe.content(), data_digest(recipe, "train", data), seed])
+    words = name_tokens(processor.tokenizer)
+    state = _State(folder / "state.safetensors", model, optimizer, identity)
+    step = state.load()
+    last = training.steps if stop_after is None else min(stop_after, training.steps)
+    reported = kept = began = time.monotonic()
+    first, lately, whole = step, [], True
+    model.train()
+    try:
+        while step < last:
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate(step, training)
+            loss = loss_at(step, model, batches[step], words, training)
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            whole = False
+            optimizer.step()
+            step += 1
+            whole = True
+            lately.append(loss.item())
+            now = time.monotonic()
+            if now - reported > PROGRESS_S or step == last:
+                left = (now - began) / (step - first) * (training.steps - step) / 60
+                report(f"step {step} of {training.steps}, loss {np.mean(lately):.3f}, {left:.0f} min left")
+                reported, lately = now, []
+            if now - kept > CHECKPOINT_S:
+                state.save(step)
+                kept = now
+    finally:
+        if whole:
+            state.save(step)
+    if step == training.steps:
+        save(model.eval(), processor, weights)
+    return weights

@@ -1,0 +1,161 @@
+"""Certifying a whole benchmark: all records on all cores, resumable, and the table of what was found."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import PACKAGE
+from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.workers import run_in_order
+from traps_pipeline.benchmark.composition import load_composition, problems
+from traps_pipeline.benchmark.foretelling import AT_MOST, FEWEST, foretold
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.certification.certify_record import Verdict, certify
+from traps_pipeline.scenes.draw.sample import Tally, load_tallies
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
+
+
+@dataclass(frozen=True)
+class Case:
+    """A record to certify, its trajectories' file, and where its verdict is kept."""
+
+    spec: SceneSpec
+    trajectory: Path
+    verdict: Path
+
+
+def certify_all(
+    folder: Path,
+    kept: Path,
+    *,
+    families: Sequence[str] | None = None,
+    workers: int | None = None,
+    fresh: bool = False,
+    report: Callable[[str], None] = lambda _: None,
+) -> tuple[list[Verdict], list[str]]:
+    """Verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
+
+    Verdicts are kept under `kept` by record and code, so that a stopped call goes on where it was.
+    """
+    released = folder / "released"
+    specs = [s for s in load_released(released).values() if families is None or s.family in families]
+    if not specs:
+        raise TrapsError(f"{released}: holds no records of {', '.join(families or ())}")
+    cases = [_case(released, kept, spec) for spec in specs]
+    if fresh:
+        for case in cases:
+            case.verdict.unlink(missing_ok=True)
+    verdicts = []
+    for done, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
+        verdicts.append(verdict)
+        if not verdict.passed or done % 20 == 0 or done == len(cases):
+            report(f"{done} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
+    found = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
+    whole = families is None and (folder / "composition.yaml").is_file()
+    found += problems(specs, load_composition(folder / "composition.yaml") if whole else None)
+    return verdicts, found + _alike(verdicts) + foreseeable(specs, verdicts)
+
+
+def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
+    trajectory = released / "trajectories" / f"{spec.scenario_id}.npz"
+    content = file_digest(trajectory) if trajectory.is_file() else "missing"
+    name = digest([spec.spec_hash, content, code_digest(spec.family)])[:24]
+    return Case(spec, trajectory, kept / f"{spec.scenario_id}-{name}.json")
+
+
+@cache
+def code_digest(family: str) -> str:
+    """Digest of the code that certifies a family: verdicts of other code are not believed."""
+    folder = PACKAGE / "scenes"
+    files = [*sorted(folder.glob("*.py")), *sorted(folder.glob("parts/*.py")), folder / "families" / f"{family}.py"]
+    return digest([[path.name, file_digest(path)] for path in files])
+
+
+def judge(case: Case) -> Verdict:
+    """The verdict on one record, from its file if it is known."""
+    if case.verdict.is_file():
+        return Verdict(**json.loads(case.verdict.read_text(encoding="utf-8")))
+    spec = case.spec
+    try:
+        qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
+        twin = load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin")
+        verdict = certify(spec, qpos, twin)
+    except (ValueError, KeyError, TypeError) as error:  # an altered record may not even build
+        verdict = Verdict(spec.scenario_id, spec.family, {"record": str(error)}, {}, same_physics=False)
+    write_text(case.verdict, json.dumps(asdict(verdict)))
+    return verdict
+
+
+def _alike(verdicts: Iterable[Verdict]) -> list[str]:
+    """Clips of different scenarios that end in the same frame: no clip may serve two scenarios."""
+    found = []
+    for side in ("control_end", "void_end"):
+        owners: defaultdict[str, list[str]] = defaultdict(list)
+        for verdict in verdicts:
+            if getattr(verdict, side):
+                owners[getattr(verdict, side)].append(verdict.scenario_id)
+        found += [f"{', '.join(ids)}: clips end in the same frame" for ids in owners.values() if len(ids) > 1]
+    return found
+
+
+def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
+    """Families of cut clips, of a hundred records or more, whose outcomes the state at the cut foretells."""
+    states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
+    families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
+    for spec in specs:
+        if spec.scenario_id in states:
+            families[spec.family].append(spec)
+    found = []
+    for family, members in families.items():
+        outcomes = [spec.ground_truth for spec in members]
+        told = foretold([states[spec.scenario_id] for spec in members], outcomes) if len(members) >= FEWEST else None
+        if told is not None and told.gain > AT_MOST:
+            found.append(
+                f"{family}: the state at the cut foretells {told.best:.3f} of the outcomes, the commonest one is "
+                f"{told.prior:.3f}; at most {AT_MOST} more is allowed"
+            )
+    return found
+
+
+def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
+    """One line a family: scenarios, passed, draws rejected, entropy of the futures and how often the
+    best guess at them is right, margins, twins, CPU seconds."""
+    tallies = load_tallies(folder / "released")
+    members: defaultdict[str, list[Verdict]] = defaultdict(list)
+    for verdict in verdicts:
+        members[verdict.family].append(verdict)
+    headings = (
+        *("family", "scenarios", "passed", "rejected", "entropy", "best guess"),
+        *("margin m", "twins", "CPU s", "other physics"),
+    )
+    rows = []
+    for family, found in sorted(members.items()):
+        twins = sum("twin" not in v.failures and "record" not in v.failures for v in found)
+        rejected = tallies.get(family, Tally(0, 0)).rejected.total()
+        others = sum(not v.same_physics for v in found)
+        spans = (_span(found, "entropy_bits", 2), _span(found, "top_share", 2), _span(found, "margin_m", 3))
+        seconds = f"{np.median([v.cpu_s for v in found]):.1f}"
+        rows.append((family, len(found), sum(v.passed for v in found), rejected, *spans, twins, seconds, others))
+    lines = [text_table(headings, rows)]
+    if any(not v.same_physics for v in verdicts):
+        lines.append(
+            "other physics: simulating here does not give the frozen trajectory bit by bit (another CPU or version); "
+            "outcome, visibility and frames are certified on the trajectory as shipped; futures are those of this "
+            "machine, which are another sample, and a chaotic twin is held against its start alone"
+        )
+    return "\n".join(lines)
+
+
+def _span(verdicts: Sequence[Verdict], name: str, digits: int) -> str:
+    values = [v.measured[name] for v in verdicts if name in v.measured]
+    return f"{min(values):.{digits}f}-{max(values):.{digits}f}" if values else "-"

@@ -1,0 +1,266 @@
+"""The arms stage: of each scenario the arms that the study asks for, filmed and certified once (docs/arms.md)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.partitions import ARMS as ARM_NAMES
+from traps_pipeline.base.partitions import beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.base.paths import PACKAGE
+from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
+from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
+from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
+from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.scenes.picture.encode import DamagedClip
+from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
+from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
+from traps_pipeline.scenes.variants.variations import VARIATIONS
+from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.outcome import Rejected
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.storage.workspace import Workspace
+
+KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, **VARIATIONS}
+SECONDS_AN_ARM = 2.0  # of one core, in the mean: one is a clip, or two questions, or a proof that it is refused
+_FOUND = ".arm.json"  # how the files end that say what came of an arm
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of an arm of a scenario, as it is kept beside its clip. of: the record and the code that it is of."""
+
+    of: str
+    refused: str | None
+    evidence: Mapping[str, Any]
+    frames: int = 0
+
+    @staticmethod
+    def read(path: Path, of: str) -> Finding | None:
+        """What is kept, if it is of this record and this code."""
+        if not path.is_file():
+            return None
+        found = Finding(**json.loads(path.read_text(encoding="utf-8")))
+        return found if found.of == of else None
+
+
+@dataclass(frozen=True)
+class Job:
+    """Arms of one scenario that are still to be filmed: arm -> its clip. Trajectories are (F, nq)."""
+
+    spec: SceneSpec
+    qpos: np.ndarray
+    twin: np.ndarray
+    clips: Mapping[str, Path]
+
+
+def asked_arms(workspace: Workspace, category: str) -> list[str]:
+    """The arms and variations of a category's scenarios that some experiment of the study asks for."""
+    asked = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
+    return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in asked]
+
+
+def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
+    """Film and certify what is missing of a category's arms, beside whoever else does so; what `share` returns. Raises
+    TrapsError."""
+    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+
+    def files(row: Row) -> list[Path]:
+        return [file for clip in _clips(workspace, row, arms).values() for file in _files(clip)]
+
+    def missing(rows: Sequence[Row]) -> list[Row]:
+        every = [file for row in rows for file in files(row)]
+        workspace.store.bring(file for file in every if file.name.endswith(_FOUND))
+        there = workspace.store.there(every)
+        return [row for row in rows if _missing(row, _clips(workspace, row, arms), there)]
+
+    def job(row: Row) -> Job | None:
+        spec, clips = spec_of(row), _clips(workspace, row, arms)
+        unmade = {arm: clip for arm, clip in clips.items() if not _is_made(spec, arm, clip)}
+        if not unmade:
+            return None
+        return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), unmade)
+
+    def tick(done: int) -> None:
+        progress.current().tick("arms", f"{category}, scenarios", done, len(specs))
+
+    filming = Filming(f"arms/{category}", missing, files, job, film)
+    return share(workspace.store, specs, filming, tick, wait=wait)
+
+
+def seconds_left(workspace: Workspace, category: str) -> float:
+    """About how long one core films what is missing of a category's arms, as far as released records tell."""
+    found = [
+        _finding_of(workspace.clip(id_, arm, spec.scene_hash))
+        for id_, spec in released_in_study(workspace, category).items()
+        for arm in asked_arms(workspace, category)
+    ]
+    return SECONDS_AN_ARM * (len(found) - len(workspace.store.there(found)))
+
+
+def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
+    """Rows of the category's arms, all of which were filmed. Raises TrapsError for one that was not, and for a damaged
+    clip."""
+    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+    of_pairs = {
+        (row["scenario_id"], row["side"]): row
+        for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
+    }
+    films = [clip for row in specs for clip in _clips(workspace, row, arms).values()]
+    workspace.store.bring(map(_finding_of, films))
+    try:
+        known = known_clips(workspace.store, films)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+    version = version_of(
+        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
+        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
+    )
+    return [one for row in specs for arm in arms for one in _rows(workspace, row, arm, of_pairs, known, version)]
+
+
+def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
+    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+
+
+def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:
+    return {arm: workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for arm in arms}
+
+
+def _missing(row: Row, clips: Mapping[str, Path], there: set[Path]) -> bool:
+    """Whether the study lacks something of these arms of a scenario."""
+    spec = spec_of(row)
+    for arm, clip in clips.items():
+        found = Finding.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in there else None
+        if found is None or (found.frames and not {clip, note_of(clip)} <= there):
+            return True
+    return False
+
+
+def _finding_of(clip: Path) -> Path:
+    return clip.with_suffix(_FOUND)
+
+
+def _files(clip: Path) -> tuple[Path, ...]:
+    """The files of an arm: its clip with the note, which a refused one has not, and what was found."""
+    return clip, note_of(clip), _finding_of(clip)
+
+
+@cache
+def _code(arm: str) -> str:
+    """The code that films an arm or a variation: after a change of it, it is filmed anew."""
+    names = ("arms.py", "offers.py") if arm in ARM_NAMES else ("variations.py",)
+    return digest([file_digest(PACKAGE / "scenes" / name) for name in names])
+
+
+def _of(spec: SceneSpec, arm: str) -> str:
+    return digest([spec.spec_hash, arm, _code(arm)])[:24]
+
+
+def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
+    """Whether an arm lies here as it was made, with its clip where it has one. Raises DamagedClip."""
+    found = Finding.read(_finding_of(clip), _of(spec, arm))
+    return found is not None and (not found.frames or read_clip(clip) is not None)
+
+
+def film(job: Job) -> int:
+    """Film and certify what is missing of a scenario; returns the number of frames drawn into clips."""
+    scenario, drawn = Scenario.of_record(job.spec, job.qpos, job.twin), 0
+    for arm, clip in job.clips.items():
+        of = _of(job.spec, arm)
+        try:
+            KNOWN[arm].ask(job.spec)
+            take = KNOWN[arm].film(scenario)
+            if take.frames:
+                drawn += save_clip(clip, take.frames, scenario.fps)
+            finding = Finding(of, None, take.evidence, len(take.frames))
+        except Rejected as why:
+            finding = Finding(of, str(why), {})
+        write_text(_finding_of(clip), json.dumps(asdict(finding)))
+    return drawn
+
+
+def _rows(
+    workspace: Workspace,
+    row: Row,
+    arm: str,
+    of_pairs: Mapping[tuple[str, str], Row],
+    known: Mapping[Path, Clip],
+    version: str,
+) -> Iterator[ArmRow]:
+    spec = spec_of(row)
+    path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
+    finding, clip = Finding.read(_finding_of(path), _of(spec, arm)), known.get(path)
+    if finding is None or (finding.frames and clip is None):
+        raise TrapsError(f"{path}: was not filmed; run again")
+    empty = ArmRow(
+        scenario_id=spec.scenario_id,
+        category=row["category"],
+        arm=arm,
+        side=sides_of(arm)[0],
+        question=spec.question,
+        labels=list(spec.labels),
+        ground_truth=None,
+        refused=finding.refused,
+        evidence=json.dumps(finding.evidence),
+        clip=None,
+        media_digest=None,
+        n_frames=None,
+        duration_s=None,
+        scene_hash=row["scene_hash"],
+        benchmark_version=version,
+    )
+    if finding.refused is not None:
+        yield replace(empty, ground_truth=None)
+        return
+    for question in KNOWN[arm].ask(spec):
+        of_pair = question.clip
+        if of_pair is not None:
+            shown = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+        else:
+            assert clip is not None, "what shows a clip of its own has frames"
+            shown = _shown(workspace.relative(path), clip)
+        yield replace(empty, **shown, **_asked(question, spec))
+
+
+def _asked(question: Question, spec: SceneSpec) -> dict[str, Any]:
+    labels = list(question.labels or spec.labels)
+    return {"side": question.side, "question": question.text, "labels": labels, "ground_truth": question.answer}
+
+
+def _shown(path: str, clip: Clip) -> dict[str, Any]:
+    return {
+        "clip": path,
+        "media_digest": clip.file_sha256,
+        "n_frames": clip.n_frames,
+        "duration_s": clip.duration_s,
+    }
+
+
+def _shown_in_pair(row: Row) -> dict[str, Any]:
+    return {
+        "clip": row["path"],
+        "media_digest": row["file_sha256"],
+        "n_frames": row["n_frames"],
+        "duration_s": row["duration_s"],
+    }
+
+
+def unmade(workspace: Workspace, category: str) -> list[str]:
+    """Why a category's table is not all that the study asks for: an arm that was not asked for then, a lost clip."""
+    table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
+    there = set(table["arm"])
+    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in there]
+    clips = sorted({str(clip) for clip in table["clip"].dropna()})
+    found = workspace.sizes(clips)
+    return reasons + [f"clip {clip} is gone" for clip in clips if clip not in found]

@@ -1,0 +1,87 @@
+"""Dagster's assets of the declared stages and sources."""
+
+from collections.abc import Iterator
+from typing import Any, cast
+
+import dagster as dg
+
+from traps_pipeline.orchestration.graph import Graph, Source, Stage
+from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
+from traps_pipeline.orchestration.translation import asset_deps, asset_key, partitions_of
+from traps_pipeline.storage.place import place_of
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+OWNERS = ["team:benchmark"]
+
+
+class WorkspaceResource(dg.ConfigurableResource):
+    """The study that a run works in."""
+
+    root: str
+
+    def open(self) -> Workspace:
+        """The workspace. Raises TrapsError naming the remedy where there is none."""
+        return Workspace.open(place_of(self.root))
+
+
+def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
+    """An asset of each stage, and an observable one of each source."""
+    return [_asset(graph, one) if isinstance(one, Stage) else _observable(one) for one in graph.declared.values()]
+
+
+def _observable(source: Source) -> dg.AssetsDefinition:
+    partitions = partitions_of(source.scheme) if source.scheme else None
+
+    @dg.observable_source_asset(
+        key=asset_key(source.name),
+        partitions_def=partitions,
+        group_name=source.group,
+        description=source.doc,
+        tags={f"dagster/kind/{kind}": "" for kind in source.kinds},
+        metadata={"owner": OWNERS[0]},
+    )
+    def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
+        opened = workspace.open()
+        if source.scheme is None:
+            return dg.DataVersion(source.version(opened, None))
+        return dg.DataVersionsByPartition({key: source.version(opened, key) for key in source.scheme.keys})
+
+    return cast(dg.AssetsDefinition, observe)
+
+
+def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
+    key, partitions = asset_key(stage.name), partitions_of(stage.scheme) if stage.scheme else None
+    checks = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in stage.checks)]
+
+    @dg.asset(
+        key=key,
+        deps=asset_deps(graph, stage.name),
+        description=stage.doc,
+        group_name=stage.group,
+        kinds={*stage.kinds},
+        owners=OWNERS,
+        partitions_def=partitions,
+        metadata=_contract(stage.table) if stage.table is not None else {},
+        code_version=stage.code,
+        tags={"cost": stage.cost} if stage.cost else None,
+        backfill_policy=dg.BackfillPolicy.single_run() if stage.scheme else None,
+        output_required=False,
+        check_specs=[
+            dg.AssetCheckSpec(name, asset=key, description=doc, blocking=blocks, partitions_def=partitions)
+            for name, doc, blocks in checks
+        ],
+    )
+    def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
+        yield from Step(stage, context, workspace.open()).run()
+
+    return asset
+
+
+def _contract(table: Table) -> dict[str, Any]:
+    """A table's columns and the meaning of a row, as Dagster shows them."""
+    columns = [
+        dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
+        for c in table.columns
+    ]
+    return {"dagster/column_schema": dg.TableSchema(columns=columns), "one row is": table.row}

@@ -1,0 +1,31 @@
+"""What a stage wants people to see of a partition beside its rows; `metadata` puts it into Dagster's words.
+
+A `Made.shown` holds plain values, texts and these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Markdown:
+    """Text that is rendered. Use it only for figures and ids, never for text that a model wrote."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Records:
+    """Rows of a small table."""
+
+    rows: Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """A file of the study that a browser opens. path: below the workspace's root."""
+
+    path: str

@@ -1,0 +1,1 @@
+"""Certificates of a pair: the evidence, its thresholds, and the ensembles of possible futures."""

@@ -1,0 +1,109 @@
+"""Certifying a record: all its certificates are measured again from its two trajectories, believing nothing it says.
+
+`certificates` defines them; `docs/scenes.md` says what each promises and what it does not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of
+from traps_pipeline.scenes.certification.evidence import Pair
+from traps_pipeline.scenes.picture.encode import frames_digest
+from traps_pipeline.scenes.worlds.outcome import Rejected
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of certifying a record.
+
+    failures: certificate -> why it cannot be given; empty if the record passes. measured: the evidence of all
+    certificates. same_physics: whether simulating here gives the frozen trajectory bit by bit. control_end, void_end:
+    digests of the clips' last frames; where these differ between scenarios the clips differ. at_cut: what moves at the
+    end of a void that is cut (`state_at_cut`); empty where a panel makes the void.
+    """
+
+    scenario_id: str
+    family: str
+    failures: Mapping[str, str]
+    measured: Mapping[str, Any]
+    same_physics: bool
+    control_end: str = ""
+    void_end: str = ""
+    at_cut: Sequence[float] = ()
+    cpu_s: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether every certificate is given."""
+        return not self.failures
+
+
+def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Verdict:
+    """Measure and judge all certificates of a record from its trajectories qpos and twin, each (F, nq).
+
+    What is measured must also be what the record has stored of it. frame_step: pixel certificates look at every so
+    many frames (1: full rate; 2: the 5 FPS sample).
+    """
+    begun = time.process_time()
+    pair = pair_of(spec, qpos, twin, frame_step=frame_step)
+    same_physics = _same_physics(pair)
+    failures: dict[str, str] = {}
+    measured: dict[str, Any] = {}
+    for certificate in certificates_for(spec.void_kind):
+        try:
+            found = certificate.measured(pair)
+        except Rejected as impossible:
+            failures[certificate.name] = str(impossible)
+            continue
+        measured |= found
+        failure = certificate.failure(measured, pair.claim)
+        failure = failure or certificate.contradiction(found, spec.evidence, exact=same_physics)
+        if failure is not None:
+            failures[certificate.name] = failure
+    control_end, void_end = _last_frames(pair)
+    return Verdict(
+        scenario_id=spec.scenario_id,
+        family=spec.family,
+        failures=failures,
+        measured=measured,
+        same_physics=same_physics,
+        control_end=control_end,
+        void_end=void_end,
+        at_cut=state_at_cut(qpos, pair.void_from).tolist() if spec.void_kind == "truncation" else [],
+        cpu_s=time.process_time() - begun,
+    )
+
+
+def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
+    """Poses in the last frame that a cut void shows, and how they changed since the frame before, (2 nq,)."""
+    last, before = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
+    return np.concatenate([last, last - before])
+
+
+def _same_physics(pair: Pair) -> bool:
+    try:
+        return pair.control.same_physics
+    except Rejected:  # the certificate `physics` says why
+        return False
+
+
+def _last_frames(pair: Pair) -> tuple[str, str]:
+    """Digests of the last frame of the control and of the void."""
+    control, last = pair.control, len(pair.control.qpos) - 1
+    if control.panel is not None and control.closing is not None:
+        (end,) = control.behind_panel([last])
+        return frames_digest([end]), frames_digest([end])
+    with control.closed_renderer() as renderer:
+        end = list(renderer.frames(control.qpos[-1:], panel=control.closing is not None))
+        if control.panel is not None:
+            void = renderer.frames(control.qpos[-1:], panel=True)
+        else:
+            void = renderer.frames(control.qpos[pair.void_from - 1 : pair.void_from])
+        return frames_digest(end), frames_digest(list(void))

@@ -1,0 +1,233 @@
+"""The futures of many starts that look the same as a control up to a cut.
+
+The initial state is perturbed far below what a pixel shows and simulated on. A rollout counts for a cut while it cannot
+be told from the control by eye. How many must count, and how they must disagree, is the certificate's (`certificates`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.flexes import vertices
+from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
+from traps_pipeline.scenes.picture.camera import Camera
+from traps_pipeline.scenes.worlds.outcome import Rejected, last_run
+from traps_pipeline.scenes.worlds.world import World
+
+if TYPE_CHECKING:
+    import mujoco
+
+TRIED = 128  # starts at most
+# Rollouts tried in all after each batch; the next batch runs only if it can change the verdict.
+BATCHES = (24, 80, TRIED)
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A cut and what it leaves open. The void shows control frames [0:frame].
+
+    accepted: rollouts with an outcome that look like the control up to the cut. unresolved: rollouts that look like it
+    but are undecided at the end; they are no outcome of their own and count nowhere else.
+    """
+
+    frame: int
+    entropy_bits: float
+    top_share: float
+    accepted: int
+    tried: int
+    unresolved: int
+    perturbation: float
+
+    def evidence(self) -> dict[str, Any]:
+        """The numbers behind the certificate `open`."""
+        return {name: value for name, value in vars(self).items() if name != "frame"}
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One perturbed future. number: which of the starts. parted: first frame that looks different from the control
+    (n_frames if none does).
+
+    qpos (F, nq) float32: its trajectory, None if it was given up or diverged.
+    """
+
+    number: int
+    parted: int
+    label: str | None
+    qpos: np.ndarray | None = None
+
+
+def entropy_bits(counts: Mapping[str, int]) -> float:
+    """Shannon entropy (bits) of outcome counts; 0 for no outcome at all."""
+    total = sum(counts.values())
+    return sum(-n / total * math.log2(n / total) for n in counts.values() if n)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What all rollouts of a control have in common. starts (TRIED, nq), shown: outline points (F, N, 2) of the
+    control."""
+
+    model: mujoco.MjModel
+    starts: np.ndarray
+    velocity: np.ndarray
+    silhouette: _Silhouette
+    shown: np.ndarray
+
+
+class Futures:
+    """Rollouts of perturbed starts of a control, simulated as they are asked for, each once.
+
+    first: the cut, or the earliest that may be; a rollout that has parted before it counts nowhere and is given up.
+    alike_px: a rollout parts from the control when a point of it is further off than this. held_s: so long a label must
+    have stood at the end to be an outcome.
+    """
+
+    def __init__(self, control: World, seed: int, *, first: int, alike_px: float, held_s: float) -> None:
+        self.first = first
+        self._control, self._seed = control, seed
+        self._alike_px, self._held = alike_px, round(held_s * control.physics.fps)
+        self._rollouts: list[Rollout] = []
+
+    def batches(self) -> Iterator[list[Rollout]]:
+        """All rollouts so far after each batch of `BATCHES`."""
+        for tried in BATCHES:
+            if len(self._rollouts) < tried:
+                self._rollouts += self._simulated(range(len(self._rollouts), tried))
+            yield self._rollouts[:tried]
+
+    def start(self, number: int) -> np.ndarray:
+        """One of the starts, (nq,) float64: it follows from the seed and the control's first row. Raises Rejected if
+        there is none of that number."""
+        if not 0 <= number < TRIED:
+            raise Rejected(f"there is no start {number}; there are {TRIED}")
+        return self._prepared.starts[number]
+
+    def rollout(self, number: int) -> Rollout:
+        """The future of one start, simulated here to its end. Raises Rejected if there is none of that number."""
+        self.start(number)
+        known = self._rollouts[number] if number < len(self._rollouts) else None
+        return self._roll(number, whole=True) if known is None or known.qpos is None else known
+
+    def _simulated(self, which: range) -> list[Rollout]:
+        with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
+            return list(pool.map(self._roll, which))
+
+    @cached_property
+    def _prepared(self) -> _Prepared:
+        import mujoco
+
+        control = self._control
+        scene = control.family.build(control.params, control.physics)
+        model = scene.spec.compile()
+        silhouette, placed = _Silhouette(model, control.camera), mujoco.MjData(model)
+        start = np.asarray(control.qpos[0], float)
+        return _Prepared(
+            model=model,
+            starts=_perturbed_starts(model, start, control.family.perturbation, self._seed),
+            velocity=initial_velocity(model, scene.velocity),
+            silhouette=silhouette,
+            shown=np.stack([silhouette.pixels(row, placed) for row in control.qpos]),
+        )
+
+    def _roll(self, number: int, *, whole: bool = False) -> Rollout:
+        """Simulate one start to the end of the control; give up if it parts before `first`, unless wanted `whole`."""
+        import mujoco
+
+        control, prepared = self._control, self._prepared
+        shown, outline = prepared.shown, prepared.silhouette
+        data, placed = mujoco.MjData(prepared.model), mujoco.MjData(prepared.model)
+        data.qpos[:], data.qvel[:] = prepared.starts[number], prepared.velocity
+        frames = np.empty((len(shown), prepared.model.nq))
+        parted = len(shown)
+        for i in range(len(shown)):
+            frames[i] = data.qpos
+            if parted == len(shown) and np.abs(outline.pixels(data.qpos, placed) - shown[i]).max() > self._alike_px:
+                parted = i
+                if i < self.first and not whole:
+                    return Rollout(number, parted, None)
+            mujoco.mj_step(prepared.model, data, control.physics.substeps)
+        if not np.isfinite(frames).all():
+            return Rollout(number, parted, None)
+        motion = replay(prepared.model, frames, control.physics)
+        labels = control.family.outcome(motion, control.params).labels
+        settled = last_run(labels) <= len(labels) - 1 - self._held
+        return Rollout(number, parted, labels[-1] if settled else None, frames.astype(np.float32))
+
+
+def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
+    """What a cut at one frame leaves open."""
+    alike = [r for r in rollouts if r.parted >= frame]
+    counts = Counter(r.label for r in alike if r.label is not None)
+    accepted = counts.total()
+    top = max(counts.values(), default=0) / max(accepted, 1)
+    return Cut(frame, entropy_bits(counts), top, accepted, len(rollouts), len(alike) - accepted, perturbation)
+
+
+def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
+    """The first accepted rollout at a cut that ends otherwise than the truth: the same clip, another answer."""
+    return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
+
+
+def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: np.ndarray) -> float:
+    """The furthest (px) that any corner or outline point of a moving body is from its place in the other trajectory."""
+    import mujoco
+
+    silhouette, placed = _Silhouette(model, camera), mujoco.MjData(model)
+    pairs = ((silhouette.pixels(a, placed), silhouette.pixels(b, placed)) for a, b in zip(qpos, twin, strict=True))
+    return max(float(np.abs(a - b).max()) for a, b in pairs)
+
+
+def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, seed: int) -> np.ndarray:
+    """TRIED starts, shape (TRIED, nq): a normal step of one scale (m, rad) on every degree of freedom."""
+    import mujoco
+
+    steps = np.random.default_rng([seed, TRIED]).normal(scale=scale, size=(TRIED, model.nv))
+    starts = np.tile(start, (TRIED, 1))
+    for row, step in zip(starts, steps, strict=True):
+        mujoco.mj_integratePos(model, row, step, 1.0)
+    return starts
+
+
+class _Silhouette:
+    """Pixels by which two poses are told apart: the corners of moving geoms' boxes, the outline of moving balls, the
+    vertices of soft bodies.
+
+    A ball's outline does not turn with the ball: its spin cannot be seen.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
+        import mujoco
+
+        self._model, self._camera = model, camera
+        moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+        ball = model.geom_type[moving] == mujoco.mjtGeom.mjGEOM_SPHERE
+        self._balls, self._solids = moving[ball], moving[~ball]
+        signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
+        boxes = model.geom_aabb[self._solids]
+        self._corners = boxes[:, None, :3] + signs * boxes[:, None, 3:]
+        right, up, _ = camera.axes()
+        outline = np.stack([right, -right, up, -up])
+        self._outline = model.geom_size[self._balls, :1, None] * outline
+
+    def pixels(self, qpos: np.ndarray, data: mujoco.MjData) -> np.ndarray:
+        """Pixel coordinates of all outline points in one pose, shape (N, 2). data: where it is computed, of the model;
+        its own for each thread, and made once, since making it takes longer than all else here."""
+        import mujoco
+
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, data)
+        rotation = data.geom_xmat[self._solids].reshape(-1, 3, 3)
+        corners = np.einsum("gij,gkj->gki", rotation, self._corners) + data.geom_xpos[self._solids, None]
+        outline = self._outline + data.geom_xpos[self._balls, None]
+        soft = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
+        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft]))

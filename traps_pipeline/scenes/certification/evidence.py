@@ -1,0 +1,172 @@
+"""What a certificate is: numbers measured of a pair, and a rule that they are held against.
+
+Measuring needs the pair. Judging is a pure function of numbers and of what the record claims, so that fresh evidence
+and stored evidence are judged alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from traps_pipeline.scenes.certification.ensemble import Futures
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Family, Physics
+from traps_pipeline.scenes.worlds.outcome import Rejected
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.scenes.worlds.world import World
+
+Evidence = Mapping[str, Any]
+VoidKind = Literal["occluder", "truncation"]
+About = Literal["control", "void", "twin", "words"]
+Judged = Iterator[str]  # the failures, in words
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What a record says of itself, which its evidence is held against besides the thresholds.
+
+    end_s: time of the control's last frame. labels: how many answers the question offers.
+    """
+
+    family: Family
+    end_s: float
+    labels: int
+    answer: str | None
+    twin_answer: str | None = None
+    question: str = ""
+    ill_posed_question: str = ""
+
+    @staticmethod
+    def of_record(spec: SceneSpec) -> Claim:
+        """What a record claims."""
+        physics = Physics(**spec.physics)
+        return Claim(
+            family=get_family(spec.family),
+            end_s=(physics.n_frames - 1) / physics.fps,
+            labels=len(spec.labels),
+            answer=spec.ground_truth,
+            twin_answer=spec.twin.ground_truth,
+            question=spec.question,
+            ill_posed_question=spec.ill_posed_question,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A pair to be certified; a draw's has no void and no twin until they are found.
+
+    futures: of perturbed starts of the control. void_frame: from which the void shows nothing decisive: the first
+    hidden frame, or the cut. rollout: which of the futures the twin is (chaotic).
+    """
+
+    control: World
+    claim: Claim
+    futures: Futures
+    void_frame: int | None = None
+    twin: World | None = None
+    rollout: int | None = None
+
+    @property
+    def void_from(self) -> int:
+        """`void_frame`. Raises Rejected as long as there is no void."""
+        if self.void_frame is None:
+            raise Rejected("the pair has no void")
+        return self.void_frame
+
+    @property
+    def other_world(self) -> World:
+        """The twin. Raises Rejected as long as there is none."""
+        if self.twin is None:
+            raise Rejected("the pair has no twin")
+        return self.twin
+
+
+@dataclass(frozen=True)
+class Number:
+    """A piece of evidence. decimals: it is stored rounded to so many. kept: it is stored in the record.
+    compared: measured again it must be what is stored; not so what another OpenGL draws otherwise. of_futures: it
+    depends on the last bit of the arithmetic, so that it is compared only where that is the record's."""
+
+    name: str
+    decimals: int | None = None
+    kept: bool = True
+    compared: bool = True
+    of_futures: bool = False
+
+    def stored(self, value: Any) -> Any:
+        """The value as a record has it."""
+        return value if self.decimals is None else round(value, self.decimals)
+
+    def is_stored(self, value: Any, stored: Any, *, exact: bool) -> bool:
+        """Whether a value measured again is the stored one; if not exact, to one unit of the last stored digit."""
+        if exact or self.decimals is None:
+            return self.stored(value) == stored
+        return abs(self.stored(value) - stored) < 1.5 * 10**-self.decimals
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A promise about a pair.
+
+    about: what must be there to measure it; words come last, after a draw has its place in its family.
+    measure(pair): all its `numbers`. judge(evidence, claim): what is wrong with the evidence, gravest first; a number
+    that records do not keep may be missing, and is then not judged (it was when the record was drawn, and is by
+    `certify`).
+    promises, does_not_promise: for the table in `docs/scenes.md`. kinds: the kinds of void that it is for.
+    """
+
+    name: str
+    about: About
+    promises: str
+    does_not_promise: str
+    numbers: tuple[Number, ...]
+    measure: Callable[[Pair], Evidence]
+    judge: Callable[[Evidence, Claim], Judged]
+    kinds: tuple[VoidKind, ...] = ("occluder", "truncation")
+
+    def measured(self, pair: Pair) -> Evidence:
+        """The evidence. Raises Rejected if there is none in this pair."""
+        evidence = self.measure(pair)
+        if list(evidence) != [number.name for number in self.numbers]:
+            raise TypeError(f"certificate {self.name}: measures {list(evidence)}, not what its `numbers` say")
+        return evidence
+
+    def failure(self, evidence: Evidence, claim: Claim) -> str | None:
+        """Why the certificate cannot be given by some evidence, None if it can."""
+        try:
+            return next(self.judge(evidence, claim), None)
+        except KeyError as missing:
+            return f"no evidence {missing}"
+
+    def contradiction(self, evidence: Evidence, stored: Evidence, *, exact: bool) -> str | None:
+        """How evidence that was measured again contradicts what a record has stored, None if it does not.
+
+        exact: this machine's arithmetic is that of the one which stored it, so that not even the last digit may differ.
+        """
+        for number in self.numbers:
+            if not (number.kept and number.compared and number.name in evidence):
+                continue
+            if number.of_futures and not exact:
+                continue
+            if number.name not in stored:
+                return f"the record has no evidence {number.name!r}"
+            if not number.is_stored(evidence[number.name], stored[number.name], exact=exact):
+                return f"{number.name} is {evidence[number.name]}, the record says {stored[number.name]}"
+        return None
+
+    def kept(self, evidence: Evidence) -> dict[str, Any]:
+        """What a record stores of the evidence."""
+        return {n.name: n.stored(evidence[n.name]) for n in self.numbers if n.kept and n.name in evidence}
+
+
+def required(certificates: Iterable[Certificate], pair: Pair, so_far: Evidence) -> dict[str, Any]:
+    """All evidence once these are measured too. Raises Rejected with the first failure."""
+    evidence = dict(so_far)
+    for certificate in certificates:
+        evidence |= certificate.measured(pair)
+        failure = certificate.failure(evidence, pair.claim)
+        if failure is not None:
+            raise Rejected(failure)
+    return evidence

@@ -1,0 +1,133 @@
+"""Giving released records what new draws of their family have: another look, or whatever rule is new.
+
+A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
+the record cost thousands of rollouts, and its new look moves neither camera nor panel, the worlds stay and what pixels
+say is measured again (`relook_family`). Either way it is the record that `sample_family` would have drawn; whoever uses
+it then runs `traps certify`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.workers import run_in_order
+from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of
+from traps_pipeline.scenes.draw.resolve import Resolved, plain
+from traps_pipeline.scenes.draw.sample import Draw, kind_of, load_tallies, record_line, save_tallies, take_out, try_draw
+from traps_pipeline.scenes.family_registry import family_digest, get_family
+from traps_pipeline.scenes.parts.look import Look, look_of_draw
+from traps_pipeline.scenes.physics.kit import params_to_dict
+from traps_pipeline.scenes.worlds.outcome import Rejected
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
+
+# Parts of a look that move neither camera nor panel.
+STILL = ("floor", "pale-floor", "light", "panel", "material", "bystanders")
+
+_Job = tuple[SceneSpec, Path, int]  # a record, the folder of trajectories and the seed of its family
+
+
+def draw_again(
+    released: Path,
+    name: str,
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+    only: Collection[str] | None = None,
+) -> dict[str, str]:
+    """Draw all records of a family, or those of some ids, again, under its looks and by the rules of today; each keeps
+    its id and its ill-posed question. Takes out those that are rejected now, so that `sample_family` fills their
+    places, and returns why, by id."""
+    return _rewritten(released, name, _drawn_again, workers, report, only)
+
+
+def relook_family(
+    released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
+) -> dict[str, str]:
+    """Give all records of a family, whose looks are in STILL, the look of their draw, and measure again what pixels
+    say. Takes out those that are no longer certified, so that `sample_family` fills their places, and returns why, by
+    id."""
+    looks = get_family(name).looks
+    assert set(looks) <= set(STILL), f"{name}: looks in {', '.join(looks)}, of which some move the camera"
+    return _rewritten(released, name, _relooked, workers, report)
+
+
+def _rewritten(
+    released: Path,
+    name: str,
+    change: Callable[[_Job], Resolved | str],
+    workers: int | None,
+    report: Callable[[str], None],
+    only: Collection[str] | None = None,
+) -> dict[str, str]:
+    """Change the records of a family, or those of some ids; what it says of a record that it rejects, by id. Those are
+    taken out."""
+    seed, rejected = load_tallies(released)[name].seed, dict[str, str]()
+    lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+    records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
+    chosen = [id_ for id_ in records if only is None or id_ in only]
+    jobs = [(records[id_], released / "trajectories", seed) for id_ in chosen]
+    for done, ((spec, folder, _), found) in enumerate(run_in_order(change, jobs, workers), start=1):
+        if isinstance(found, str):
+            rejected[spec.scenario_id] = found
+        else:
+            save_trajectory(folder, spec.scenario_id, found.qpos, found.twin)
+            records[spec.scenario_id] = found.spec
+        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {done} of {len(jobs)}")
+    write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
+    tallies = load_tallies(released)
+    tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(get_family(name).looks))
+    save_tallies(released, tallies)
+    take_out(released, {id_: kind_of(why) for id_, why in rejected.items()})
+    return rejected
+
+
+def _drawn_again(job: _Job) -> Resolved | str:
+    """What the draw of a record gives today, under the record's names, or why it is rejected."""
+    spec, _, seed = job
+    found = try_draw(Draw(spec.family, seed, spec.seed, frozenset(), tuple(sorted(get_family(spec.family).looks))))
+    if isinstance(found, str):
+        return found
+    worlds = [{field: value for field, value in each.params.items() if field != "look"} for each in (spec, found.spec)]
+    if worlds[0] != worlds[1]:
+        return "its draw gives another scene"
+    names = {"scenario_id": spec.scenario_id, "ill_posed_question": spec.ill_posed_question}
+    return Resolved(found.spec.model_copy(update=names), found.qpos, found.twin)
+
+
+def _relooked(job: _Job) -> Resolved | str:
+    """A record with the look of its draw, or which certificate it loses under it."""
+    spec, folder, seed = job
+    family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"
+    look = look_of_draw(seed, spec.family, spec.seed, sorted(family.looks))
+    qpos = load_trajectory(path, spec.trajectory_sha256)
+    twin = load_trajectory(path, spec.twin.trajectory_sha256, "twin")
+    seen = with_look(spec, look, qpos, twin)
+    return seen if isinstance(seen, str) else Resolved(seen, qpos, twin)
+
+
+def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
+    """A record under a look that moves neither camera nor panel, or which certificate it loses; those of rollouts stay.
+    qpos, twin: its trajectories, (F, nq) each."""
+    family = get_family(spec.family)
+    dressed = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
+    other = spec.twin.params
+    if other is not None:
+        other = plain(params_to_dict(replace(family.params_from(other), look=look)))
+    seen = spec.model_copy(update={"params": dressed, "twin": spec.twin.model_copy(update={"params": other})})
+    pair, evidence = pair_of(seen, qpos, twin), dict(spec.evidence)
+    for certificate in certificates_for(spec.void_kind):
+        if any(number.of_futures for number in certificate.numbers):
+            continue  # thousands of rollouts, of which no picture is drawn
+        try:
+            measured = certificate.measured(pair)
+        except Rejected as rejected:
+            return f"{certificate.name}: {rejected}"
+        failure = certificate.failure({**evidence, **measured}, pair.claim)
+        if failure is not None:
+            return f"{certificate.name}: {failure}"
+        evidence |= certificate.kept(measured)
+    return seen.model_copy(update={"evidence": evidence})

@@ -1,0 +1,293 @@
+"""Drawing scenarios of a family until its quotas are full, and writing them down as released records.
+
+Draws are numbered and independent, so they run on all cores; acceptance goes through them in order, so that the same
+seed gives the same scenarios. Every accepted scenario is written at once: a sampling that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.workers import run_in_order
+from traps_pipeline.scenes.certification.certificates import settled_outcome
+from traps_pipeline.scenes.draw.likeness import first_look, too_alike
+from traps_pipeline.scenes.draw.resolve import Resolved, resolve
+from traps_pipeline.scenes.family_registry import family_digest, fit_to_sample, get_family
+from traps_pipeline.scenes.parts.look import look_of_draw
+from traps_pipeline.scenes.parts.wording import draw_ill_posed
+from traps_pipeline.scenes.physics.kit import Family
+from traps_pipeline.scenes.physics.simulate import replay
+from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, simulated
+from traps_pipeline.scenes.worlds.pace import LATEST_SHARE, out_of_pace, settles_share
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
+
+MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
+DRAWS = "draws.json"  # beside the records: how each family was drawn
+_MEASURED = re.compile(r"\d[\d.]*|'\w+'(?=\s)")  # numbers and answers in a reason, which differ from draw to draw
+_WORDED = 128  # questions by which the share of an answer is known
+_UNASKED = "?"  # stands for the ill-posed question until the scenario has its place
+
+
+@dataclass
+class Tally:
+    """How a family was drawn: the seed, scenarios wanted, draws made, why the others were rejected, the digest of the
+    family's file (empty in notes that were written before it was kept), and the parts of the look that vary."""
+
+    seed: int
+    wanted: int
+    draws: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    file: str = ""
+    look: list[str] = field(default_factory=list)
+
+
+def load_tallies(released: Path) -> dict[str, Tally]:
+    """Family to how its records were drawn, from `draws.json` beside them."""
+    path = released / DRAWS
+    if not path.is_file():
+        return {}
+    notes = json.loads(path.read_text(encoding="utf-8"))
+    return {name: Tally(**note | {"rejected": Counter(note["rejected"])}) for name, note in notes.items()}
+
+
+def answer_quota(count: int, n_labels: float) -> int:
+    """How often one answer may occur among `count` scenarios of a family.
+
+    Under ten: once more than the even split, rounded up. Else 60 % of two answers, 1.5 times the fair share of more.
+    """
+    if count < 10:
+        return math.ceil(count / n_labels) + 1
+    return math.floor(count * (0.6 if n_labels == 2 else 1.5 / n_labels))
+
+
+def ill_posed_quota(taxonomy: str, count: int) -> int:
+    """How often one ill-posed text may occur: once in an occlusion family, in 5 % of a chaotic one."""
+    return 1 if taxonomy == "occlusion" else max(1, count // 20)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One numbered draw of a family. closed: answers that have their quota already and need not be resolved."""
+
+    family: str
+    seed: int
+    number: int
+    closed: frozenset[str]
+    look: tuple[str, ...] = ()
+
+
+def sample_family(
+    name: str,
+    count: int,
+    seed: int,
+    released: Path,
+    *,
+    look: Collection[str] = (),
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> Tally:
+    """Draw until `released` holds `count` scenarios of a family; the same seed gives the same ones on a machine type.
+
+    Goes on where a stopped call with the same seed and count was, and fills the places of records that were taken out
+    (`take_out`); anything else of the family is replaced, as are records of another version of the family's file.
+    look: parts of the look (`look.PARTS`) that vary besides those that always do in the family.
+    `report` gets a line for each record and for the first rejection of each kind. Raises RuntimeError with the tally of
+    rejections when 40 draws a scenario are not enough, TrapsError for an unfit family.
+    """
+    family, records = fit_to_sample(name), Records(released, name)
+    tally, file, parts = load_tallies(released).get(name), family_digest(name), sorted({*family.looks, *look})
+    if tally is not None and (tally.seed, tally.wanted) == (seed, count) and tally.file not in ("", file):
+        report(f"{name}: its file was changed since its scenarios were drawn; all are drawn again")
+        tally = None
+    if tally is None or (tally.seed, tally.wanted, tally.look) != (seed, count, parts):
+        tally = Tally(seed, count, file=file, look=parts)
+        records.clear()
+    specs = records.read(tally)
+    answers = Counter(spec.ground_truth for spec in specs)
+    texts = Counter(spec.ill_posed_question for spec in specs)
+    looks = {} if len(specs) == count else {spec.scenario_id: first_look(spec, records.qpos(spec)) for spec in specs}
+    taken = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
+    places = [place for place in range(1, count + 1) if place not in taken]
+    if not places:
+        return tally
+
+    def jobs() -> Iterator[Draw]:
+        for number in range(tally.draws, MOST_DRAWS * count):
+            yield Draw(name, seed, number, _closed(answers, count, family), tuple(parts))
+
+    said: set[str] = set()  # kinds of rejections that the report has
+    # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
+    results = run_in_order(try_draw, jobs(), workers, ahead=len(places))
+    try:
+        for draw, found in results:
+            tally.draws += 1
+            if isinstance(found, Resolved) and found.spec.ground_truth in _closed(answers, count, family):
+                found = f"answer {found.spec.ground_truth!r} has its quota"
+            picture = first_look(found.spec, found.qpos) if isinstance(found, Resolved) else 0
+            if isinstance(found, Resolved) and (other := too_alike(looks, picture, count)):
+                found = f"its first frame looks like that of another: {other}"
+            if isinstance(found, str):
+                tally.rejected[found.split(":")[0]] += 1
+                if kind_of(found) not in said:  # so that a family that never passes says why at once
+                    said.add(kind_of(found))
+                    report(f"{name}: draw {draw.number + 1} is rejected: {found}")
+                continue
+            placed = _named(family, found, draw, places.pop(0), texts, count)
+            looks[placed.spec.scenario_id] = picture
+            answers[placed.spec.ground_truth] += 1
+            texts[placed.spec.ill_posed_question] += 1
+            records.append(placed, tally)
+            report(f"{placed.spec.scenario_id}: {placed.spec.ground_truth} after {tally.draws} draws")
+            if not places:
+                records.sort()
+                return tally
+    finally:
+        results.close()  # type: ignore[attr-defined]
+    reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common())
+    raise RuntimeError(f"{name}: {answers.total()} of {count} after {tally.draws} draws; rejected: {reasons}")
+
+
+def kind_of(reason: str) -> str:
+    """What a rejection has in common with others: its reason without what was measured, and without details."""
+    return _MEASURED.sub("", reason.split(":")[0])
+
+
+class Records:
+    """The released files of a family: `<family>.jsonl`, one record a line, `trajectories/<scenario_id>.npz`, and the
+    family's place in `draws.json`, which is written last and so vouches for the others."""
+
+    def __init__(self, released: Path, family: str) -> None:
+        self._released, self._family = released, family
+        self._lines = released / f"{family}.jsonl"
+
+    def clear(self) -> None:
+        """Take away whatever is there of the family."""
+        self._lines.unlink(missing_ok=True)
+        for old in (self._released / "trajectories").glob(f"{self._family}-*.npz"):
+            old.unlink()
+
+    def read(self, tally: Tally) -> list[SceneSpec]:
+        """The records of the draws that the tally counts; a record after them was cut off and is dropped."""
+        if not self._lines.is_file():
+            return []
+        specs = []
+        for line in self._lines.read_text(encoding="utf-8").splitlines():
+            try:
+                specs.append(SceneSpec.model_validate(json.loads(line)))
+            except ValueError:  # a line that a kill tore
+                break
+        kept = [spec for spec in specs if spec.seed < tally.draws]
+        write_text(self._lines, "".join(record_line(spec) for spec in kept))
+        return kept
+
+    def qpos(self, spec: SceneSpec) -> np.ndarray:
+        """The trajectory of a record that was read."""
+        return load_trajectory(self._released / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
+
+    def sort(self) -> None:
+        """Put the records in the order of their ids: those that fill a place were added last."""
+        lines = self._lines.read_text(encoding="utf-8").splitlines()
+        lines.sort(key=lambda line: json.loads(line)["scenario_id"])
+        write_text(self._lines, "".join(f"{line}\n" for line in lines))
+
+    def append(self, found: Resolved, tally: Tally) -> None:
+        """Add a scenario and note how far the drawing is."""
+        save_trajectory(self._released / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
+        with self._lines.open("a", encoding="utf-8") as lines:
+            lines.write(record_line(found.spec))
+        save_tallies(self._released, load_tallies(self._released) | {self._family: tally})
+
+
+def take_out(released: Path, reasons: Mapping[str, str]) -> None:
+    """Take records (id -> why, as it is counted in `draws.json`) out of their families, with their trajectories: the
+    next `sample_family` with the same seed and count fills their places with later draws. Raises KeyError for an id
+    that is not there."""
+    tallies = load_tallies(released)
+    for family in sorted({scenario_id.rpartition("-")[0] for scenario_id in reasons}):
+        lines = released / f"{family}.jsonl"
+        records = {r["scenario_id"]: line for line in lines.read_text("utf-8").splitlines() if (r := json.loads(line))}
+        for scenario_id in [id_ for id_ in reasons if id_.rpartition("-")[0] == family]:
+            del records[scenario_id]
+            tallies[family].rejected[reasons[scenario_id]] += 1
+            (released / "trajectories" / f"{scenario_id}.npz").unlink()
+        write_text(lines, "".join(f"{line}\n" for line in records.values()))
+    save_tallies(released, tallies)
+
+
+def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
+    """Write `draws.json`."""
+    notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
+    write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
+
+
+def record_line(spec: SceneSpec) -> str:
+    """A record as its file has it."""
+    return json.dumps(spec.model_dump(mode="json"), ensure_ascii=False) + "\n"
+
+
+def _closed(answers: Counter[str], count: int, family: Family) -> frozenset[str]:
+    choices = _choices(family)
+    return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, choices[answer]))
+
+
+@cache
+def _choices(family: Family) -> Mapping[str, float]:
+    """Answer to the number of choices of which it would be one as often as chance gives it, over many draws: that of
+    the questions, where each offers the same ones, and more for an answer that not all of them offer."""
+    rng = np.random.default_rng(0)
+    drawn = [family.word(family.draw(rng), rng).labels for _ in range(_WORDED)]
+    shares = defaultdict[str, float](float)
+    for labels in drawn:
+        for label in labels:
+            shares[label] += 1 / len(labels) / len(drawn)
+    rare = float(len(drawn))  # an answer that none of them offers
+    return defaultdict(lambda: rare, {label: 1 / share for label, share in shares.items()})
+
+
+def try_draw(draw: Draw) -> Resolved | str:
+    """A draw, resolved, or why it is rejected."""
+    family = get_family(draw.family)
+    rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
+    params = family.draw(rng)
+    wording = family.word(params, rng)
+    params = replace(params, look=look_of_draw(draw.seed, draw.family, draw.number, draw.look))
+    try:
+        answer = simulated_answer(family, params)
+        if answer in draw.closed:
+            return f"answer {answer!r} has its quota"
+        return resolve(family, params, wording, _UNASKED, scenario_id=f"{family.name}-0000", seed=draw.number)
+    except Rejected as rejected:
+        return str(rejected)
+
+
+def _named(family: Family, found: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
+    """The scenario with its id and an ill-posed question that its family still has room for."""
+    physics = family.physics
+    inventory = family.build(family.params_from(found.spec.params), physics).inventory
+    most = ill_posed_quota(family.taxonomy, count)
+    rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, place])
+    question = draw_ill_posed(family.taxonomy, inventory, rng, lambda text: texts[text] < most)
+    names = {"scenario_id": f"{family.name}-{place:04d}", "ill_posed_question": question}
+    return Resolved(found.spec.model_copy(update=names), found.qpos, found.twin)
+
+
+def simulated_answer(family: Family, params: Any) -> str:
+    """What the control of a draw shows: a second's work, so that a draw without a place costs no certificates."""
+    model, scene = compile_scene(family, params, family.physics)
+    qpos = simulated(model, scene, family.physics)
+    outcome = settled_outcome(family, replay(model, qpos, family.physics), params)
+    share = settles_share(outcome.commit_frame, len(qpos))
+    if share > LATEST_SHARE:  # where it settles too early the clip will end earlier
+        raise Rejected(str(out_of_pace(share)))
+    return outcome.answer

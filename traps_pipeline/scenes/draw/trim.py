@@ -1,0 +1,92 @@
+"""How little a panel covers: no more than its twin needs.
+
+A family says what its panel hides at the most, as a box (`Scene.cover`). How much of that must be hidden follows from
+the pair: where control and twin differ in any frame, where anything of the hidden element shows, and where decisive
+bodies, or their shadows, are from the last frame before the outcome settles. The panel is cut to that, upright on the
+floor as before, and the camera stays. What else the family's box held is then seen: it is the same in both worlds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from traps_pipeline.scenes.certification.evidence import Pair
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Panel
+from traps_pipeline.scenes.worlds.outcome import decisive_geoms
+
+MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the other
+
+
+def trimmed(pair: Pair) -> Iterator[Pair]:
+    """The pair behind one panel after another, the smallest first: cut to what its twin needs with the one margin and
+    with the other, and as it is. Each may still lose a certificate. The pair must have a panel, a twin and an
+    outcome."""
+    panel = pair.control.panel
+    assert panel is not None, "only a panel can be trimmed"
+    needed = must_hide(pair)
+    panels = [cut_to(panel, pair.control.camera, needed, margin) for margin in MARGINS_PX]
+    for smaller in dict.fromkeys((*panels, panel)):
+        control, twin = (replace(world, panel=smaller) for world in (pair.control, pair.other_world))
+        yield replace(pair, control=control, twin=twin, void_frame=control.past_panel.hidden_from())
+
+
+def must_hide(pair: Pair) -> np.ndarray:
+    """The pixels of a 480x360 frame that a panel must cover, (H, W) bool, found without any panel."""
+    control, twin = pair.control, pair.other_world
+    until = max(control.outcome.commit_frame - 1, 0)
+    decisive = decisive_geoms(control.model, control.scene.decisive)
+    with control.renderer() as renderer:
+        whole = list(renderer.frames(control.qpos))
+        needed = _differ(whole, renderer.frames(control.qpos, without=control.scene.hidden))
+        needed |= _differ(whole[until:], renderer.frames(control.qpos[until:], without=decisive))
+    with twin.renderer() as renderer:
+        return needed | _differ(whole, renderer.frames(twin.qpos))
+
+
+def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> Panel:
+    """The least upright panel in a panel's plane, and within it, that covers some pixels (H, W) and so many around
+    them; the panel as it is if there are none."""
+    rows, columns = np.nonzero(needed)
+    if not len(rows):
+        return panel
+    left, right = columns.min() - margin_px, columns.max() + 1 + margin_px
+    top, bottom = rows.min() - margin_px, rows.max() + 1 + margin_px
+    ahead, across = _directions(panel)
+    corners = np.array([[x, y] for x in (left, right) for y in (top, bottom)], dtype=float)
+    on_plane = _on_plane(camera, corners, ahead, float(np.array(panel.centre) @ ahead) - panel.half[1])
+    side, middle = on_plane @ across, float(np.array(panel.centre) @ across)
+    low, high = max(side.min(), middle - panel.half[0]), min(side.max(), middle + panel.half[0])
+    height = min(float(on_plane[:, 2].max()), 2 * panel.half[2])
+    centre = np.array(panel.centre) + across * ((low + high) / 2 - middle)
+    x, y = (round(float(v), 6) for v in centre[:2])
+    half = (round((high - low) / 2, 6), panel.half[1], round(height / 2, 6))
+    return replace(panel, centre=(x, y, half[2]), half=half)
+
+
+def _differ(frames: Sequence[np.ndarray], others: Iterator[np.ndarray]) -> np.ndarray:
+    """Where any frame differs from its other one, on the grid of 480x360."""
+    found = np.zeros((HEIGHT, WIDTH), bool)
+    for frame, other in zip(frames, others, strict=True):
+        unlike = (frame != other).any(axis=2)
+        fine = unlike.shape[0] // HEIGHT
+        found |= unlike.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
+    return found
+
+
+def _directions(panel: Panel) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors of a panel: away from the camera, and to the camera's right."""
+    azimuth = np.radians(panel.yaw_deg + 90.0)
+    return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+
+
+def _on_plane(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
+    """Where the lines of sight through pixels (N, 2) meet the upright plane so far ahead, (N, 3)."""
+    right, up, forward = camera.axes()
+    focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
+    sideways, upwards = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
+    rays = forward + sideways[:, None] * right + upwards[:, None] * up
+    eye = camera.position()
+    return eye + rays * ((front - eye @ ahead) / (rays @ ahead))[:, None]

@@ -1,0 +1,96 @@
+"""Families by name. A family's module is imported when it is asked for; adding a file adds a family.
+
+What would spoil a benchmark is refused: an unknown category, a question that two families have, a hidden element that
+is drawn depending on what is seen.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+import re
+from functools import cache
+from pathlib import Path
+
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
+from traps_pipeline.scenes import families as package
+from traps_pipeline.scenes.parts.independence import dependence
+from traps_pipeline.scenes.physics.kit import Family
+
+CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES + EXTENSION_CATEGORIES, "chaotic": CHAOTIC_CATEGORIES}
+
+
+@cache
+def family_names() -> tuple[str, ...]:
+    """Names of all families, sorted; nothing is imported."""
+    return tuple(sorted(module.name for module in pkgutil.iter_modules(package.__path__)))
+
+
+@cache
+def get_family(name: str) -> Family:
+    """The family of that name. Raises KeyError with the known names, TrapsError if there is none in its file, or one of
+    another name or of an unknown category."""
+    if name not in family_names():
+        raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
+    module = importlib.import_module(f"{package.__name__}.{name}")
+    family = getattr(module, "FAMILY", None)
+    if not isinstance(family, Family):
+        raise TrapsError(f"{_file(name)} defines no FAMILY = scene_family(...); write it, or take the file away")
+    if family.name != name:
+        raise TrapsError(
+            f"{_file(name)} defines a family named {family.name!r}; give it the name of its file, {name!r}, or rename "
+            "the file"
+        )
+    known = CATEGORIES[family.taxonomy]
+    if family.category not in known:
+        raise TrapsError(
+            f"{_file(name)}: unknown category {family.category!r}; write one of the categories of {family.taxonomy} "
+            f"families: {', '.join(known)}"
+        )
+    return family
+
+
+def family_digest(name: str) -> str:
+    """Hexadecimal SHA-256 of a family's file: records of one digest were drawn by the same text."""
+    found = importlib.util.find_spec(f"{package.__name__}.{name}")
+    assert found is not None and found.origin is not None, f"{_file(name)} is a file"
+    return file_digest(Path(found.origin))
+
+
+@cache
+def families() -> tuple[Family, ...]:
+    """All families, in the order of their names. Raises TrapsError if two have one question template: an observer would
+    not know which of them is asked."""
+    found = tuple(get_family(name) for name in family_names())
+    asking: dict[str, str] = {}
+    for family in found:
+        for template in family.questions:
+            other = asking.setdefault(re.sub(r"\{\w+\}", "{}", template), family.name)
+            if other != family.name:
+                raise TrapsError(
+                    f"{_file(other)} and {_file(family.name)} have one question template, {template!r}; "
+                    "word it differently in the newer one"
+                )
+    return found
+
+
+@cache
+def fit_to_sample(name: str) -> Family:
+    """The family of that name, if scenarios may be drawn of it. Raises TrapsError if its question is another family's
+    too, or if its hidden element is drawn depending on what is seen."""
+    families()
+    family = get_family(name)
+    found = dependence(family)
+    if found is not None:
+        raise TrapsError(
+            f"{_file(name)}: the hidden element is drawn depending on what is seen: {found}; "
+            "draw it from nothing but its own values, `hidden(...)`, and what is seen not from it"
+        )
+    return family
+
+
+def _file(name: str) -> str:
+    return f"scenes/families/{name}.py"

@@ -1,0 +1,104 @@
+"""Whether what is hidden is drawn independently of what is seen: otherwise the void would give its answer away.
+
+Tested over draws: which of a scene's possible worlds was drawn (it and its twins, in a fixed order) must not go with a
+parameter that they share, nor with two of them together. So it does not matter how a family draws and makes its twins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.kit import Family, params_to_dict
+
+DRAWS = 600
+CHANCE = 1e-8  # a table of counts that chance gives more rarely than this is no chance: thousands are looked at
+MOST_WORLDS = 64
+LEAST_EXPECTED = 5  # draws of each world in a row of a table; rarer values share a row
+
+
+def dependence(family: Family) -> str | None:
+    """How the hidden element goes with what is seen: '`rough` goes with `direction`'; None if it does not."""
+    if family.twins is None:
+        return None
+    scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]
+    hidden = sorted(
+        {name for first, *others in scenes for other in others for name in first if other[name] != first[name]}
+    )
+    keys = [[[world[name] for name in hidden] for world in worlds] for worlds in scenes]
+    drawn = np.array([sorted(of_worlds).index(of_worlds[0]) for of_worlds in keys])
+    numbers = np.array([len(worlds) for worlds in scenes])
+    for number in np.unique(numbers):  # which of three lanes, which of four: each number of worlds by itself
+        chosen = np.flatnonzero(numbers == number)
+        if number < 2 or len(chosen) < 4 * LEAST_EXPECTED * number:
+            continue
+        seen = _rows([_flat({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in chosen])
+        tables = [((name,), rows) for name, rows in seen.items()]
+        tables += [((a, b), seen[a] * (seen[b].max() + 1) + seen[b]) for a, b in combinations(seen, 2)]
+        for names, rows in tables:
+            if _goes_together(drawn[chosen], _pooled(rows, LEAST_EXPECTED * int(number))):
+                return f"`{', '.join(hidden)}` goes with {' and '.join(f'`{name}`' for name in names)}"
+    return None
+
+
+def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
+    """A scene and its twins, their twins and so on, each once: all that may be behind the panel."""
+    assert family.twins is not None
+    found, waiting = [], [params]
+    while waiting and len(found) < MOST_WORLDS:
+        world = waiting.pop(0)
+        if world not in found:
+            found.append(world)
+            waiting += family.twins(world)
+    return [params_to_dict(world) for world in found]
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Numbers and names by where they stand: tuples by length and place."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, list | tuple):
+            found[f"len({prefix}{name})"] = len(value)
+            found |= _flat({f"{name}[{i}]": item for i, item in enumerate(value)}, prefix)
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """For every parameter that varies, the row that each scene falls into: its value, or the quarter that holds it."""
+    found = {}
+    for name in sorted(set().union(*scenes)):
+        values = [scene.get(name) for scene in scenes]
+        distinct = sorted(set(values), key=repr)
+        if len(distinct) > 8 and not any(isinstance(value, str) for value in distinct):
+            numbers = np.array([np.nan if value is None else value for value in values], float)
+            rows = np.searchsorted(np.nanquantile(numbers, [0.25, 0.5, 0.75]), numbers)
+        else:
+            rows = np.array([distinct.index(value) for value in values])
+        if rows.any():
+            found[name] = rows
+    return found
+
+
+def _pooled(rows: np.ndarray, least: int) -> np.ndarray:
+    """Rows from 0 on, those with fewer scenes than `least` in one."""
+    _, rows, counts = np.unique(rows, return_inverse=True, return_counts=True)
+    return np.unique(np.where(counts[rows] < least, -1, rows), return_inverse=True)[1]
+
+
+def _goes_together(worlds: np.ndarray, rows: np.ndarray) -> bool:
+    """Pearson's chi-square test of a table of counts."""
+    from scipy.special import chdtrc
+
+    table = np.zeros((worlds.max() + 1, rows.max() + 1))
+    np.add.at(table, (worlds, rows), 1)
+    table = table[table.any(axis=1)]
+    if 1 in table.shape:
+        return False
+    expected = table.sum(axis=1, keepdims=True) * table.sum(axis=0) / table.sum()
+    freedom, chi_square = (table.shape[0] - 1) * (table.shape[1] - 1), ((table - expected) ** 2 / expected).sum()
+    return bool(chdtrc(freedom, chi_square) < CHANCE)

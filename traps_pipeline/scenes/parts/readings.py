@@ -1,0 +1,118 @@
+"""What a run comes to: for every frame the label that holds, and by how much the end is clear of any other outcome.
+
+A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
+(F,), lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.kit import Motion, Reading
+
+Labels = list[str | None]
+
+
+# --- from when something holds ----------------------------------------------------------------------------------------
+
+
+def lasting_from(holds: np.ndarray) -> int:
+    """The first frame from which `holds` (F,) is true to the end; F if it is not true at the end."""
+    broken = np.flatnonzero(~holds)
+    return int(broken[-1]) + 1 if broken.size else 0
+
+
+def still_from(*paths: np.ndarray, within_m: float) -> int:
+    """The first frame from which all paths stay within so many metres of where they end.
+
+    A path is (F,), a place along a line, or (F, ..., 3), places in space.
+    """
+    moves = [np.abs(path - path[-1]) if path.ndim == 1 else np.linalg.norm(path - path[-1], axis=-1) for path in paths]
+    restless = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in moves]
+    return lasting_from(~np.any(restless, axis=0))
+
+
+def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
+    """How far (m) a thing ends past a line, `past` (F,) m above 0, or how far its front, so much ahead of its middle,
+    ends before the line."""
+    return float(past[-1] if past[-1] > 0 else -past[-1] - before_m)
+
+
+# --- readings ---------------------------------------------------------------------------------------------------------
+
+
+def undecided(motion: Motion) -> Labels:
+    """No label in any frame: a run that has no valid outcome."""
+    return [None] * len(motion.times)
+
+
+def held_from(first: int, label: str, motion: Motion) -> Labels:
+    """One label, from a frame on."""
+    return [label if i >= first else None for i in range(len(motion.times))]
+
+
+def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = True) -> Labels:
+    """'yes' while `holds` (F,); 'no' while it does not, from frame `no_from` on and only where `no_where` (F,)."""
+    no_where = np.broadcast_to(no_where, holds.shape)
+    return [
+        "yes" if yes else "no" if i >= no_from and no else None
+        for i, (yes, no) in enumerate(zip(holds, no_where, strict=True))
+    ]
+
+
+def side_while(valid: np.ndarray, past: np.ndarray, over: str = "yes", under: str = "no") -> Labels:
+    """`over` where `past` (F,) is above 0 and `under` elsewhere, in the frames where `valid` (F,)."""
+    return [(over if x > 0 else under) if counts else None for x, counts in zip(past, valid, strict=True)]
+
+
+def crossed(past: np.ndarray, valid: np.ndarray | bool = True) -> Reading:
+    """'yes' if `past` (F,) m ends above 0, else 'no': from when it is `valid` and on that side to the end.
+
+    The margin is how far from 0 it ends.
+    """
+    first = lasting_from(valid & (np.sign(past) == np.sign(past[-1])))
+    answer = "yes" if past[-1] > 0 else "no"
+    return Reading([answer if i >= first else None for i in range(len(past))], float(abs(past[-1])))
+
+
+def came_through(rear_past: np.ndarray, radius_m: float) -> Reading:
+    """'yes' from when the rear of a ball is out, `rear_past` (F,) m above 0; 'no' from when it stays where it ends.
+
+    The margin is how far the ball ends out, or how far its front is from coming out.
+    """
+    end = rear_past[-1]
+    if end > 0:
+        return Reading(["yes" if x > 0 else None for x in rear_past], float(end))
+    first = lasting_from(np.abs(rear_past - end) <= radius_m)
+    return Reading(["no" if i >= first else None for i in range(len(rear_past))], float(-end - 2 * radius_m))
+
+
+def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead_s: float) -> Reading:
+    """Who is first past the line: `ahead` (F, N) m above 0, one column a name.
+
+    No reading at all if somebody never gets past or the lead is below `min_lead_s`. The margin is how far the second
+    still is from the line when the first is past it.
+    """
+    past = ahead > 0
+    margin = float(-np.sort(ahead[int(past.any(axis=1).argmax())])[-2])
+    arrivals = motion.times[past.argmax(axis=0)]
+    first, second = np.sort(arrivals)[:2]
+    if not past[-1].all() or second - first < min_lead_s:
+        return Reading(undecided(motion), margin)
+    winner, frames = names[int(arrivals.argmin())], np.sort(past.argmax(axis=0))
+    labels = [winner if t >= first else None for t in motion.times]
+    return Reading(labels, margin, (int(frames[0]), int(frames[1])))
+
+
+def top_m(motion: Motion, body: str, height_m: float, floor_m: float = 0.0) -> np.ndarray:
+    """Height over a floor of the middle of a standing or fallen body's top (m), shape (F,)."""
+    return motion.pos(body)[:, 2] - floor_m + motion.rot(body)[:, 2, 2] * height_m / 2
+
+
+def turns_deg(rotations: np.ndarray) -> float:
+    """How far (degrees) a body is turned, in the frame where it is most, from how it stands at first. rotations: its
+    matrices, (F, 3, 3)."""
+    traces = np.einsum("fij,ij->f", rotations, rotations[0])
+    return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))

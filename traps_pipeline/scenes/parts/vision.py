@@ -1,0 +1,245 @@
+"""Classical vision for observers: where a colour is in a frame, and how it moves (OpenCV, no knowledge of the scene).
+
+Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
+`kit.COLOURS`. A colour that is none of them (most panels') belongs to no mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from traps_pipeline.scenes.parts.look import PANELS
+
+FLAG_PX = (60, 50)  # a flag is no wider and no higher
+PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
+EDGE = 60  # least contrast of an edge
+MOVED_PX = 24  # what moves changes more pixels from frame to frame
+CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
+# Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
+_HUES: Mapping[str, tuple[float, float, float, float]] = {
+    "red": (346, 8, 0.62, 0.22),
+    "orange": (18, 37, 0.74, 0.30),
+    "yellow": (40, 60, 0.62, 0.35),
+    "green": (115, 155, 0.50, 0.16),
+    "cyan": (174, 196, 0.50, 0.25),
+    "blue": (208, 236, 0.55, 0.33),
+    "purple": (268, 300, 0.40, 0.20),
+}
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A connected region: centroid, bounding box (x, y, width, height) and area, all in pixels."""
+
+    x: float
+    y: float
+    box: tuple[int, int, int, int]
+    area: int
+
+    @property
+    def fill(self) -> float:
+        """Share of the bounding box that the region covers: 1 for an upright rectangle, 0.79 for a disc."""
+        return self.area / (self.box[2] * self.box[3])
+
+
+def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
+    """Where a frame has a colour, bool (360, 480), tolerant of shade and of compression."""
+    hsv = cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
+    hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
+    if colour in _HUES:
+        low, high, least_saturation, least_value = _HUES[colour]
+        inside = (hue >= low) & (hue <= high) if low < high else (hue >= low) | (hue <= high)
+        return inside & (saturation >= least_saturation) & (value >= least_value)
+    match colour:
+        case "wood":
+            return (hue >= 18) & (hue <= 42) & (saturation >= 0.40) & (saturation < 0.72) & (value >= 0.2)
+        case "white":
+            return (saturation < 0.10) & (value >= 0.86)
+        case "grey":
+            return (saturation < 0.12) & (value >= 0.25) & (value < 0.68)
+        case "black":
+            return (value < 0.19) & ((saturation < 0.35) | (value < 0.07))
+        case "navy":
+            return (hue >= 215) & (hue <= 245) & (saturation >= 0.5) & (value < 0.33)
+    raise ValueError(f"no colour {colour!r}")
+
+
+def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
+    """Connected regions of a mask, largest first."""
+    count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    found = [
+        Blob(
+            float(centres[i][0]),
+            float(centres[i][1]),
+            (int(stats[i][0]), int(stats[i][1]), int(stats[i][2]), int(stats[i][3])),
+            int(stats[i][4]),
+        )
+        for i in range(1, count)
+        if stats[i][4] >= min_area
+    ]
+    return sorted(found, key=lambda blob: -blob.area)
+
+
+def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
+    """The largest region of a colour, None if the colour is not seen."""
+    return next(iter(blobs(colour_mask(frame, colour), min_area)), None)
+
+
+def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
+    """The largest region of a colour that cover panels have, in light or shade, with the lines on it."""
+    pixels, found = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
+    for named in PANELS.values():
+        colour = np.array(named, np.float32)
+        bright = pixels @ colour / (colour @ colour)
+        off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
+        found |= (bright > 0.5) & (bright < 1.1) & (off < 0.06 * bright)
+    lines = np.ones((9, 9), np.uint8)  # are no wider
+    return next(iter(blobs(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
+
+
+def slanting_edges(
+    frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where edges in a part of a frame fall to the left and where they fall to the right, bool of the part's shape.
+
+    slants: between how many rows a column they fall.
+    """
+    grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, x, 1 - x)[part] for x in (1, 0))
+    slope = -across / np.where(down == 0, 1e-3, down)
+    edges = (np.hypot(across, down) > EDGE) & (np.abs(slope) > slants[0]) & (np.abs(slope) < slants[1])
+    return edges & (slope < 0), edges & (slope > 0)
+
+
+def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
+    """The largest region of a colour in every frame."""
+    return [largest(frame, colour, min_area) for frame in frames]
+
+
+def before_panel(frames: np.ndarray) -> np.ndarray:
+    """The frames before a panel comes that stands to the end of the clip; all of them if none comes.
+
+    A panel comes in one step: a large region turns to one colour (but for its shadow), which is not that of what is
+    around it, and stays as it is. What stands from the first frame on does not come; where a panel goes, the scene goes
+    on.
+    """
+    for at in range(1, len(frames)):
+        changed = _apart(frames[at], frames[at - 1]) > CHANGED
+        if changed.sum() < PANEL_PX:
+            continue
+        count, names = cv2.connectedComponents(changed.astype(np.uint8), connectivity=4)
+        sizes = np.bincount(names.ravel(), minlength=count)
+        sizes[0] = 0
+        region = names == sizes.argmax()
+        around = cv2.dilate(region.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool) & ~region
+        before, colour = (np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at]))
+        even, beside = ((_apart(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
+        was_even = (_apart(frames[at - 1][region], before) <= ALIKE).mean()
+        stays = (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean()
+        stands_out = beside < 0.3 or (beside < 0.75 and was_even < even)  # some of what is around it may be as dark
+        if sizes.max() >= PANEL_PX and even > 0.6 and stands_out and stays > 0.9:
+            return frames[:at]
+    return frames
+
+
+def after_panel(frames: np.ndarray) -> np.ndarray:
+    """The frames after a panel goes that stands from the first one on; all of them if none goes."""
+    return before_panel(frames[::-1])[::-1]
+
+
+def moved(frames: np.ndarray) -> np.ndarray:
+    """Where the last frame differs from the one before, bool (360, 480)."""
+    return _apart(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
+
+
+def before_hold(frames: np.ndarray) -> np.ndarray:
+    """The frames without those at the end in which nothing moves any more; at least one."""
+    shown = len(frames)
+    while shown > 1 and moved(frames[:shown]).sum() < MOVED_PX:
+        shown -= 1
+    return frames[:shown]
+
+
+def still(frames: np.ndarray) -> bool:
+    """Whether nothing moves in the last two steps that are shown."""
+    return moved(frames).sum() < MOVED_PX and moved(frames[:-1]).sum() < MOVED_PX
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """By how many levels two pictures of bytes differ, pixel by pixel, in the channel where they differ most."""
+    apart = np.maximum(a, b) - np.minimum(a, b)
+    return np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])  # 20 times as fast as max(axis=-1)
+
+
+def without_flags(frames: np.ndarray) -> np.ndarray:
+    """The frames with every flag painted over by what is beside it: a flag stands for a thing and is none.
+
+    A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
+    black flag the mast is told apart only below.
+    """
+    still = np.median(frames, axis=0).astype(np.uint8)
+    shown = frames.copy()
+    for left, top, width in _masts(still):
+        for seed in ((left + width + 3, top + 5), (left + width + 3, top - 4)):
+            patch = _patch(still, seed)
+            if patch is None or patch[0] > left + width + 3:
+                continue
+            x, y, wide, high = patch
+            box = np.s_[y : y + high, x : x + wide]
+            changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - still[box])
+            rests = (changes[1] > 40).any(axis=-1).mean()  # a thing that lies before the patch is smaller than it
+            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12 or rests > 0.03:
+                continue  # neither flies at the end of the mast, or it moves
+            above = max(0, min(top, y) - 4)
+            beside = shown[:, above, max(0, left - 4)]
+            shown[:, above + 2 : y + high + 3, left - 1 : x + wide + 3] = beside[:, None, None]
+            break
+    return shown
+
+
+def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
+    """Box (x, y, width, height) of the patch of one colour around a pixel (x, y), if it may be a flag."""
+    height, width = still.shape[:2]
+    if not (0 <= seed[0] < width and 0 <= seed[1] < height):
+        return None
+    region = np.zeros((height + 2, width + 2), np.uint8)
+    flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
+    _, _, _, (x, y, wide, high) = cv2.floodFill(still.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags)
+    filled = region[1:-1, 1:-1][y : y + high, x : x + wide].mean()
+    fits = 8 <= wide <= FLAG_PX[0] and 6 <= high <= FLAG_PX[1] and filled > 0.6
+    return (x, y, wide, high) if fits else None
+
+
+def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
+    """Upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
+    light = still.max(axis=2)
+    beside = cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((1, 7), np.uint8))
+    thin = ((light < 125) & (np.ptp(still, axis=2) < 30) & (cv2.subtract(beside, light) > 30)).astype(np.uint8)
+    tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
+    count, names = cv2.connectedComponents(tall, connectivity=8)
+    found = []
+    for name in range(1, count):
+        y, x = np.nonzero(names == name)
+        end = x[y < y.min() + 6]
+        if np.ptp(x) < 3 * np.ptp(y) and np.ptp(end) < 12:
+            found.append((int(end.min()), int(y.min()), int(np.ptp(end)) + 1))
+    return found
+
+
+def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:
+    """Whether the tracked thing is seen in each of the last frames and stays where it is."""
+    tail = path[-last:]
+    seen = [blob for blob in tail if blob is not None]
+    if len(seen) < last:
+        return False
+    xs, ys = [blob.x for blob in seen], [blob.y for blob in seen]
+    return max(xs) - min(xs) <= tolerance_px and max(ys) - min(ys) <= tolerance_px
+
+
+def is_panel(blob: Blob, longest_px: int = 130) -> bool:
+    """Whether a region is too long for a thing of a tabletop scene, or so thin that only a panel's edge is."""
+    return max(blob.box[2:]) > longest_px or min(blob.box[2:]) < 5

@@ -1,0 +1,266 @@
+"""The words of a scenario: question templates that can be read back, and ill-posed questions with their proof.
+
+An ill-posed question is drawn from shared templates over the scene's inventory, and checked by vocabulary alone, so
+that a question which a reviewer wrote is checked in the same way (docs/spec.md 2.4).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+
+import numpy as np
+
+from traps_pipeline.scenes.parts.offers import without_choices
+from traps_pipeline.scenes.physics.kit import COLOURS, Inventory, Taxonomy
+
+YES_OR_NO, LEFT_OR_RIGHT, ANY_TWO = ("yes", "no"), ("left", "right"), ("this", "that")
+
+# --- well-posed questions ---------------------------------------------------------------------------------------------
+
+
+@cache
+def _pattern(template: str) -> re.Pattern[str]:
+    parts = re.split(r"\{(\w+)\}", template)
+    seen: set[str] = set()
+    pattern = ""
+    for i, part in enumerate(parts):
+        if i % 2 == 0:
+            pattern += re.escape(part)
+        else:
+            pattern += f"(?P={part})" if part in seen else f"(?P<{part}>.+?)"
+            seen.add(part)
+    return re.compile(pattern)
+
+
+def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
+    """The values that a question fills its template's placeholders with, also without the choices that it may offer;
+    None if it fits none of the templates."""
+    for template in (*templates, *_open_forms(tuple(templates))):
+        match = _pattern(template).fullmatch(question)
+        if match:
+            return match.groupdict()
+    return None
+
+
+@cache
+def _open_forms(templates: tuple[str, ...]) -> list[str]:
+    """Templates without their choices: those that they spell out ('yes or no'), or those of the scenario."""
+    forms = []
+    for template in templates:
+        filled = template.replace("{choices}", " or ".join(ANY_TWO))
+        forms += [without_choices(filled, labels) for labels in (YES_OR_NO, LEFT_OR_RIGHT, ANY_TWO)]
+    return [form for form in forms if form is not None]
+
+
+def choices_in(text: str) -> tuple[str, ...]:
+    """The choices that `kit.listed` reads out: 'red, blue or green' -> red, blue, green."""
+    return tuple(re.split(r", | or ", text))
+
+
+# --- ill-posed questions about what no video shows (occlusion) --------------------------------------------------------
+
+# Property -> (words that ask for it, templates over a thing that is in view).
+BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "mass": (
+        r"\b(grams?|kilograms?|weighs?|weight|mass)\b",
+        ("How many grams does the {thing} weigh?", "What is the mass of the {thing} in kilograms?"),
+    ),
+    "temperature": (
+        r"\b(temperature|degrees celsius|warm|hot|cold)\b",
+        ("What is the temperature of the {thing} in degrees Celsius?",),
+    ),
+    "price": (r"\b(costs?|price|paid)\b", ("What did the {thing} cost?", "What is the price of the {thing}?")),
+    "age": (
+        r"\b(year was|how old|years old)\b",
+        ("In which year was the {thing} made?", "How old is the {thing} in years?"),
+    ),
+    "maker": (
+        r"\b(name of the (person|company)|who (made|built|owns))\b",
+        ("What is the name of the person who set up the {thing}?", "Who owns the {thing}?", "Who made the {thing}?"),
+    ),
+    "sound": (
+        r"\b(loud|decibels?|sounds? like|noise)\b",
+        ("How loud is the {thing}, in decibels?", "How much noise does the {thing} make when it is touched?"),
+    ),
+    "smell or taste": (r"\b(smells?|taste)\b", ("What does the {thing} smell of?",)),
+    "inside": (
+        # What is open shows its inside.
+        r"^(?!.*\b(tray|bin|basket|pen|lane|box|bucket|tunnel|funnel|bridge)s?\b).*\b(hollow|inside of the)\b",
+        ("Is the {thing} hollow or solid?", "What colour is the inside of the {thing}?"),
+    ),
+    "later": (
+        r"\b(hours? later|one hour after|next day|a year later|tomorrow)\b",
+        (
+            "Where will the {thing} be one hour after the clip ends?",
+            "Will the {thing} still be in the same place the next day?",
+        ),
+    ),
+    "earlier": (
+        r"\b(before the clip|the day before|yesterday)\b",
+        ("Where was the {thing} the day before?", "Who touched the {thing} just before the clip began?"),
+    ),
+    "off screen": (
+        r"\b(behind the camera|outside the picture)\b",
+        ("How far is the {thing} from the wall behind the camera?",),
+    ),
+    "electric charge": (r"\b(electric charge|volts)\b", ("What is the electric charge of the {thing}?",)),
+    "material strength": (
+        r"\b(newtons?|break)\b",
+        ("How many newtons would it take to break the {thing}?",),
+    ),
+}
+
+
+def beyond_video(question: str) -> str | None:
+    """The property that no video shows and that the question asks for; None if it asks for none of them."""
+    text = question.lower()
+    return next((name for name, (words, _) in BEYOND_VIDEO.items() if re.search(words, text)), None)
+
+
+# --- ill-posed questions with a false premise (chaotic) ---------------------------------------------------------------
+
+# sRGB of colours that nothing in a scene has by that name; the others are as they are drawn.
+_ELSEWHERE: Mapping[str, tuple[float, float, float]] = {
+    "pink": (1.00, 0.75, 0.80),
+    "magenta": (1.00, 0.00, 1.00),
+    "gold": (1.00, 0.84, 0.00),
+    "silver": (0.75, 0.75, 0.75),
+}
+ABSENT_COLOURS = (*_ELSEWHERE, "red", "green", "blue", "yellow", "orange", "purple")
+LIGHTS = (0.7, 1.0, 1.5)  # by which light and shade multiply a colour; the edges of dice glow
+FAR_COLOUR = 25.0  # CIELAB distance from which nobody takes one colour for the other
+ABSENT_OBJECTS = (
+    "triangle",
+    "spring",
+    "trapdoor",
+    "windmill",
+    "pendulum",
+    "domino",
+    "hammer",
+    "rubber duck",
+    "ladder",
+    "pyramid",
+    "magnet",
+    "balloon",
+    "bell",
+    "candle",
+    "clock",
+    "ring",
+    "rope",
+    "toy car",
+    "feather",
+    "propeller",
+)
+# What colours do not have, whatever the scene shows.
+NO_QUALITY_OF_A_COLOUR = r"\b(weight|mass|price|sound|decibels|temperature|speed|weigh|loud|cost)\b.*\bcolou?r\b"
+_FALSE_PREMISES = (
+    "What material is the {absent} made of?",
+    "How often does the {object} hit the {absent}?",
+    "What colour is the {absent}?",
+    "Is the {absent} to the left or to the right of the {object}?",
+    "How far does the {absent} travel?",
+    "How many {absent}s does the {object} touch?",
+    "When does the {object} pass the {absent}?",
+    "What is written on the {absent}?",
+    "Does the {absent} move before or after the {object}?",
+    "Where does the {colour} {object} end up?",
+    "How many times does the {colour} {object} turn over?",
+    "What does the {colour} {object} hit first?",
+    "Which way does the {present} arrow point?",
+    "How many {present} stripes does the {object} have?",
+    "What is the weight of the colour {present}?",
+    "How loud is the colour {present}, in decibels?",
+    "What is the temperature of the colour {present}?",
+    "What does the colour {present} cost?",
+)
+_COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
+
+
+def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
+    """All that the question presumes and the scene's inventory refutes. near: and colours that it does not have, but
+    has others like them: a viewer may take these for a second false premise, though they refute nothing."""
+    text, found = question.lower(), []
+    for thing in (*ABSENT_OBJECTS, "arrow", "stripe"):
+        if re.search(rf"\b{thing}(s|es)?\b", text) and thing not in inventory.objects:
+            found.append(f"there is no {thing}")
+    quality = re.search(NO_QUALITY_OF_A_COLOUR, text)
+    if quality:
+        found.append(f"a colour has no {quality.group(1)}")
+    for colour in sorted(_COLOUR_WORDS):
+        if re.search(rf"\b{colour}\b", text) and colour not in inventory.colours:
+            if not near and not is_far(colour, inventory.colours):
+                continue
+            found.append(f"nothing is {colour}")
+    return found
+
+
+def false_premise(question: str, inventory: Inventory) -> str | None:
+    """What the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
+    return next(iter(false_premises(question, inventory)), None)
+
+
+def is_far(colour: str, present: Sequence[str]) -> bool:
+    """Whether a colour is none of some others and is not easily taken for one of them: at least `FAR_COLOUR` away."""
+    return colour not in present and all(colour_distance(colour, other) >= FAR_COLOUR for other in present)
+
+
+@cache
+def colour_distance(one: str, other: str) -> float:
+    """Least Euclidean distance in CIELAB (D65) of a named colour from another one, in shade and in bright light too."""
+    known = {**COLOURS, **_ELSEWHERE}
+    seen = (tuple(min(1.0, light * part) for part in known[other]) for light in LIGHTS)
+    return min(float(np.linalg.norm(_lab(known[one]) - _lab(as_lit))) for as_lit in seen)
+
+
+def _lab(srgb: Sequence[float]) -> np.ndarray:
+    """CIELAB of an sRGB colour in [0, 1]."""
+    value = np.array(srgb)
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    t = to_xyz @ linear / np.array([0.9505, 1.0, 1.089])
+    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def refutation(taxonomy: Taxonomy, question: str, inventory: Inventory) -> str | None:
+    """Why the question cannot be answered from the control; None if nothing says so."""
+    return beyond_video(question) if taxonomy == "occlusion" else false_premise(question, inventory)
+
+
+def draw_ill_posed(
+    taxonomy: Taxonomy, inventory: Inventory, rng: np.random.Generator, free: Callable[[str], bool] = lambda _: True
+) -> str:
+    """An ill-posed question about a scene that is still free to use. Raises ValueError when all are taken."""
+    questions = list(_beyond_video(inventory) if taxonomy == "occlusion" else _false_premises(inventory, rng))
+    for i in rng.permutation(len(questions)):
+        question = questions[i]
+        if not free(question) or refutation(taxonomy, question, inventory) is None:
+            continue
+        if taxonomy == "occlusion" or len(false_premises(question, inventory, near=True)) == 1:
+            return question
+    raise ValueError("every ill-posed question about this scene is taken; name more things in its inventory")
+
+
+def _beyond_video(inventory: Inventory) -> Iterator[str]:
+    for _, templates in BEYOND_VIDEO.values():
+        for template in templates:
+            for thing in inventory.things:
+                yield template.format(thing=thing)
+
+
+def _false_premises(inventory: Inventory, rng: np.random.Generator) -> Iterator[str]:
+    absent = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
+    colours = [colour for colour in ABSENT_COLOURS if is_far(colour, inventory.colours)]
+    present = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
+    for template in _FALSE_PREMISES:
+        if "{colour}" in template and not colours:
+            continue
+        for _ in range(6):
+            yield template.format(
+                absent=rng.choice(absent),
+                colour=rng.choice(colours) if colours else "",
+                present=rng.choice(present),
+                object=rng.choice(inventory.objects),
+            )

@@ -1,0 +1,90 @@
+"""A built scene to its trajectory (qpos at frame times), and a trajectory to the poses of its bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.flexes import carriers, elements, flexes, vertices
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
+    """qvel at the start: each named free body gets its six numbers, each named soft body the first three, by which all
+    of it moves. Shape (nv,)."""
+    qvel, soft = np.zeros(model.nv), flexes(model)
+    for body, values in velocity.items():
+        if body in soft:
+            for address in model.body_dofadr[carriers(model, soft[body])]:
+                qvel[address : address + 3] = values[:3]
+            continue
+        address = model.body(body).dofadr[0]
+        qvel[address : address + 6] = values
+    return qvel
+
+
+def simulate(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
+    """qpos at every frame time, shape (F, nq), float32: what is frozen and replayed. Raises if the solver diverges."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qvel[:] = initial_velocity(model, scene.velocity)
+    frames = np.empty((physics.n_frames, model.nq), np.float32)
+    for i in range(physics.n_frames):
+        frames[i] = data.qpos
+        mujoco.mj_step(model, data, physics.substeps)
+    bad = int(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
+    if bad or not np.isfinite(frames).all():
+        raise FloatingPointError(f"simulation diverged ({bad} bad accelerations)")
+    return frames
+
+
+def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
+    """Body poses of a trajectory, and where its soft bodies are; no dynamics."""
+    import mujoco
+
+    data, soft = mujoco.MjData(model), flexes(model)
+    names = [model.body(i).name for i in range(1, model.nbody)]
+    positions = np.empty((len(qpos), model.nbody, 3))
+    rotations = np.empty((len(qpos), model.nbody, 9))
+    bent = {name: np.empty((len(qpos), int(model.flex_vertnum[i]), 3)) for name, i in soft.items()}
+    for i, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        positions[i], rotations[i] = data.xpos, data.xmat
+        for name, places in bent.items():
+            places[i] = vertices(model, data, soft[name])
+    return Motion(
+        times=np.arange(len(qpos)) / physics.fps,
+        positions={name: positions[:, i + 1] for i, name in enumerate(names)},
+        rotations={name: rotations[:, i + 1].reshape(-1, 3, 3) for i, name in enumerate(names)},
+        vertices=bent,
+    )
+
+
+def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Corners of the bounding boxes of all moving geoms, and of the elements of soft bodies, over a trajectory, eight
+    by eight, shape (N, 3)."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    moving = np.flatnonzero(model.body_dofnum[model.geom_bodyid] > 0)
+    signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
+    centre, half = model.geom_aabb[moving, :3], model.geom_aabb[moving, 3:]
+    local = centre[:, None] + signs[None] * half[:, None]
+    points, soft = [], flexes(model).values()
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        rotation = data.geom_xmat[moving].reshape(-1, 3, 3)
+        points.append(np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[moving][:, None])
+        for flex in soft:
+            at, reach = vertices(model, data, flex)[elements(model, flex)], float(model.flex_radius[flex])
+            middle, wide = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
+            points.append(middle[:, None] + signs[None] * wide[:, None])
+    return np.concatenate(points).reshape(-1, 3)

@@ -1,0 +1,1 @@
+"""Camera, rendering, encoding, and the pixel checks of a simulated world."""

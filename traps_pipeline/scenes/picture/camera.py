@@ -1,0 +1,163 @@
+"""Where the camera stands and where the cover panel stands: both fitted, neither placed by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.kit import Box, Vec3, View
+
+WIDTH, HEIGHT = 480, 360
+FRAME_FILL = 0.92  # share of the half-frame that the fitted points may use
+PANEL_MARGIN = 0.03  # the panel reaches this much (m) beyond what it must hide, as seen from the camera
+PANEL_GAP = 0.02  # distance (m) between the panel and the nearest point that it hides
+PANEL_HALF_THICKNESS = 0.006
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A resolved free camera. extent and centre fix MuJoCo's `stat`, hence clipping planes and the shadow map."""
+
+    lookat: Vec3
+    distance: float
+    azimuth_deg: float
+    elevation_deg: float
+    fovy_deg: float
+    extent: float
+    centre: Vec3
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> Camera:
+        """The camera of a stored spec."""
+        return Camera(**_tuples(record))
+
+    def axes(self) -> np.ndarray:
+        """Rows: right, up, forward unit vectors in the world, shape (3, 3)."""
+        return _axes(self.azimuth_deg, self.elevation_deg)
+
+    def position(self) -> np.ndarray:
+        """World position of the eye, shape (3,)."""
+        return np.array(self.lookat) - self.distance * self.axes()[2]
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixel coordinates (x right, y down) of world points at 480x360, shape (N, 2)."""
+        right, up, depth = self.axes() @ (np.atleast_2d(points) - self.position()).T
+        focal = HEIGHT / 2 / np.tan(np.radians(self.fovy_deg) / 2)
+        return np.stack([WIDTH / 2 + focal * right / depth, HEIGHT / 2 - focal * up / depth], axis=1)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """The cover panel: an opaque upright box facing the camera. half: across, thickness, up (m)."""
+
+    centre: Vec3
+    half: Vec3
+    yaw_deg: float
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> Panel:
+        """The panel of a stored spec."""
+        return Panel(**_tuples(record))
+
+    def corners(self) -> np.ndarray:
+        """The eight corners in the world, shape (8, 3)."""
+        local = Box(tuple(-h for h in self.half), self.half).corners()  # type: ignore[arg-type]
+        c, s = np.cos(np.radians(self.yaw_deg)), np.sin(np.radians(self.yaw_deg))
+        return local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array(self.centre)
+
+
+@dataclass(frozen=True)
+class Closing:
+    """How a control ends: from this frame on a panel stands before its outcome, in an occlusion scene that of its void,
+    where the void has it."""
+
+    frame: int
+    panel: Panel
+
+
+def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+
+
+@cache  # points are projected for every pose of every rollout
+def _axes(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+    a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([np.sin(a), -np.cos(a), 0.0])
+    axes = np.stack([right, np.cross(right, forward), forward])
+    axes.setflags(write=False)
+    return axes
+
+
+def fit_camera(view: View, points: np.ndarray) -> Camera:
+    """The nearest camera in the view's direction that has all points (N, 3) within FRAME_FILL of the frame.
+
+    With the orientation given, each frame edge is a half-space for the eye: the two pairs of edges give the largest
+    admissible forward position, and the eye is centred between the edges that have slack.
+    """
+    right, up, forward = (points @ axis for axis in _axes(view.azimuth_deg, view.elevation_deg))
+    tan_v = np.tan(np.radians(view.fovy_deg) / 2) * FRAME_FILL
+    tan_h = tan_v * WIDTH / HEIGHT
+    edges = [(np.max(x - t * forward), np.max(-x - t * forward)) for x, t in ((right, tan_h), (up, tan_v))]
+    eye_forward = min(-(high + low) / (2 * t) for (high, low), t in zip(edges, (tan_h, tan_v), strict=True))
+    eye_right, eye_up = ((high - low) / 2 for high, low in edges)
+    axes = _axes(view.azimuth_deg, view.elevation_deg)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    distance = float(centre @ axes[2] - eye_forward)
+    eye = np.array([eye_right, eye_up, eye_forward]) @ axes
+    return Camera(
+        lookat=_vec(eye + distance * axes[2]),
+        distance=round(distance, 6),
+        azimuth_deg=view.azimuth_deg,
+        elevation_deg=view.elevation_deg,
+        fovy_deg=view.fovy_deg,
+        extent=round(float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)) / 2), 6),
+        centre=_vec(centre),
+    )
+
+
+def fit_panel(camera: Camera, cover: Box) -> Panel:
+    """The smallest upright panel on the floor, just in front of `cover`, that hides all of it from the camera."""
+    eye = camera.position()
+    azimuth = np.radians(camera.azimuth_deg)
+    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    corners = cover.corners()
+    front = float((corners @ ahead).min()) - PANEL_GAP - 2 * PANEL_HALF_THICKNESS
+    reach = (corners - eye) @ ahead
+    on_plane = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
+    side = on_plane @ across
+    low, high = float(side.min()) - PANEL_MARGIN, float(side.max()) + PANEL_MARGIN
+    top = float(on_plane[:, 2].max()) + PANEL_MARGIN
+    centre = across * (low + high) / 2 + ahead * (front + PANEL_HALF_THICKNESS) + np.array([0, 0, top / 2])
+    return Panel(
+        centre=_vec(centre),
+        half=(round((high - low) / 2, 6), PANEL_HALF_THICKNESS, round(top / 2, 6)),
+        yaw_deg=camera.azimuth_deg - 90.0,
+    )
+
+
+def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Panel | None]:
+    """Camera and panel together: the panel is placed by the camera, and the camera must have the panel in frame."""
+    camera, panel = fit_camera(view, points), None
+    if cover is None:
+        return camera, None
+    for _ in range(12):
+        panel = fit_panel(camera, cover)
+        camera = fit_camera(view, np.concatenate([points, panel.corners()]))
+    return camera, fit_panel(camera, cover)
+
+
+def in_frame(camera: Camera, points: np.ndarray) -> bool:
+    """Whether all points (N, 3) are inside the frame."""
+    pixels = camera.project(points)
+    return bool((pixels > 0).all() and (pixels < (WIDTH, HEIGHT)).all())
+
+
+def _vec(values: np.ndarray) -> Vec3:
+    x, y, z = (round(float(v), 6) for v in values)
+    return (x, y, z)

@@ -1,0 +1,229 @@
+"""Frames of a trajectory: MuJoCo's classic renderer at twice the size, averaged 2x2 (sharper and faster than MSAA).
+
+One off-screen GL context lives as long as the process; each `Renderer` owns one `MjrContext` for its model.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.flexes import flexes
+from traps_pipeline.scenes.physics.kit import FLOOR_GROUP, PANEL_GROUP, REMOVED_GROUP
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera
+
+if TYPE_CHECKING:
+    import mujoco
+
+SUPERSAMPLE = 2
+_gl_context: object | None = None
+_renderer_open = False  # contexts of two models in one GL context would draw into each other's buffers
+
+
+class RenderingUnavailable(RuntimeError):
+    """No usable off-screen GL; the message says what to install."""
+
+
+def _make_current(width: int, height: int) -> None:
+    global _gl_context
+    if _gl_context is None:
+        try:
+            import mujoco
+
+            _gl_context = mujoco.GLContext(width, height)  # type: ignore[attr-defined]
+            atexit.register(_gl_context.free)  # type: ignore[attr-defined]
+        except (ImportError, AttributeError, OSError, RuntimeError) as error:
+            raise RenderingUnavailable(
+                f"no off-screen OpenGL (MUJOCO_GL={os.environ.get('MUJOCO_GL')}): {error}; "
+                "on Debian: apt-get install libosmesa6"
+            ) from error
+    _gl_context.make_current()  # type: ignore[attr-defined]
+
+
+def gl_version() -> str:
+    """What draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by another
+    version may differ in single pixels. Only while a Renderer is open."""
+    from OpenGL.GL import GL_VERSION, glGetString
+
+    said = glGetString(GL_VERSION)
+    return said.decode(errors="replace") if isinstance(said, bytes) else "an unknown OpenGL"
+
+
+def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
+    """Give each plane a size that reaches beyond what the camera sees. An infinite one is drawn as a grid of 200 x 200
+    cells in each pass, a third of a frame's time in some scenes; a finite one as 2 x 2. Collisions know no difference.
+    Its texture lies where that of the infinite one does: by its centre where the half size is an odd number of repeats
+    (`settexture` and `makePlane` of MuJoCo)."""
+    import mujoco
+
+    reach = 1.05 * model.vis.map.zfar * camera.extent
+    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+        material = model.geom_matid[plane]
+        repeats_a_metre = model.mat_texrepeat[material] if material >= 0 else np.ones(2)
+        wanted_m = reach + float(np.abs(camera.position() - model.geom_pos[plane]).max())
+        halves = (np.ceil(wanted_m * repeats_a_metre / 2) * 2 + 1) / repeats_a_metre
+        model.geom_size[plane] = [*halves, halves.max()]  # at last the spacing of the grid
+
+
+class Renderer:
+    """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB, or
+    (720, 960, 3) of a model whose look is as fine as that."""
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
+        global _renderer_open
+        if _renderer_open:
+            raise RuntimeError("a Renderer is open in this process; close it before the next one")
+        self._fine = max(1, model.vis.global_.offheight // (HEIGHT * SUPERSAMPLE))  # where a look says so
+        self._width, self._height = (side * SUPERSAMPLE * self._fine for side in (WIDTH, HEIGHT))
+        _make_current(self._width, self._height)
+        import mujoco
+
+        model.vis.global_.offwidth, model.vis.global_.offheight = self._width, self._height
+        model.vis.global_.fovy = camera.fovy_deg
+        model.stat.extent = camera.extent
+        model.stat.center[:] = camera.centre
+        _make_floors_finite(model, camera)
+        self._pixels = np.empty((self._height, self._width, 4), np.uint8)
+        self._drawn: tuple[object, ...] | None = None  # what the picture in `_pixels` is of
+        self._model, self._data, self._soft = model, mujoco.MjData(model), flexes(model)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=2000)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        self._camera.lookat[:] = camera.lookat
+        self._camera.distance = camera.distance
+        self._camera.azimuth, self._camera.elevation = camera.azimuth_deg, camera.elevation_deg
+        _renderer_open = True
+        self._draw(model.qpos0, panel=True, without=())
+        self._drawn = None  # a first picture differs from later ones, in single pixels
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        global _renderer_open
+        _renderer_open = False
+        self._context.free()
+
+    def frames(
+        self, qpos: Sequence[np.ndarray] | np.ndarray, *, panel: bool = False, without: Sequence[str] = ()
+    ) -> Iterator[np.ndarray]:
+        """RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation)."""
+        import cv2
+
+        for row in qpos:
+            raw = self._draw(row, panel=panel, without=without)
+            small = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
+            yield cv2.flip(cv2.cvtColor(small, cv2.COLOR_RGBA2RGB), 0)
+
+    def visible_pixels(
+        self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, panel: bool = False
+    ) -> np.ndarray:
+        """How many pixels (of the 480x360 frame, so quarters occur) each geom or soft body has in each frame, shape
+        (F, G)."""
+        import mujoco
+
+        kinds = (int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_FLEX))
+        things = [(kinds[self._is_soft(name)], self._number(name)) for name in geoms]
+        counts = np.zeros((len(qpos), len(things)))
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        try:
+            for i, row in enumerate(qpos):
+                rgba = self._draw(row, panel=panel, without=())
+                pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
+                shapes = self._scene.geoms[: self._scene.ngeom]
+                drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
+                seen = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
+                counts[i] = [seen.get(thing, 0) / (SUPERSAMPLE * self._fine) ** 2 for thing in things]
+        finally:
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        return counts
+
+    def _draw(self, qpos: np.ndarray, *, panel: bool, without: Sequence[str]) -> np.ndarray:
+        """The picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn again
+        while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves is
+        taken away. (The model does not change while it is drawn.)"""
+        import mujoco
+
+        self._data.qpos[:] = qpos
+        self._place()
+        wanted = (*self._places(panel, without), panel, tuple(without), self._scene.flags.tobytes())
+        if wanted == self._drawn:
+            return self._pixels
+        self._drawn = None
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 1
+        option.geomgroup[PANEL_GROUP] = int(panel)
+        option.geomgroup[FLOOR_GROUP] = option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
+        everything, unmoved = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvPerturb()
+        groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
+        self._model.geom_group[self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR_GROUP
+        for name in without:
+            of = self._model.flex_group if self._is_soft(name) else self._model.geom_group
+            of[self._number(name)] = REMOVED_GROUP
+        try:
+            mujoco.mjv_updateScene(self._model, self._data, option, unmoved, self._camera, everything, self._scene)
+            # The floor last: what stands before it is not painted over. The same picture, up to a fifth sooner.
+            for of in (option.geomgroup, option.flexgroup, option.sitegroup, option.tendongroup, option.skingroup):
+                of[:] = 0
+            option.geomgroup[FLOOR_GROUP] = 1
+            mujoco.mjv_addGeoms(self._model, self._data, option, unmoved, everything, self._scene)
+            self._add_haze()
+        finally:
+            self._model.geom_group[:], self._model.flex_group[:] = groups, soft_groups
+        viewport = mujoco.MjrRect(0, 0, self._width, self._height)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        self._read()
+        self._drawn = wanted
+        return self._pixels
+
+    def _add_haze(self) -> None:
+        """Let the far end of the floor fade: MuJoCo draws that haze where it finds an infinite plane, for which it
+        takes this one, which has no area."""
+        import mujoco
+
+        for plane in np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[:1]:
+            place, turn = self._data.geom_xpos[plane], self._data.geom_xmat[plane]
+            unseen = self._scene.geoms[self._scene.ngeom]
+            mujoco.mjv_initGeom(unseen, mujoco.mjtGeom.mjGEOM_PLANE, np.zeros(3), place, turn, np.ones(4, np.float32))
+            self._scene.ngeom += 1
+
+    def _is_soft(self, name: str) -> bool:
+        return name in self._soft
+
+    def _number(self, name: str) -> int:
+        """Of a geom, or of a soft body."""
+        return self._soft[name] if self._is_soft(name) else self._model.geom(name).id
+
+    def _places(self, panel: bool, without: Sequence[str]) -> tuple[bytes, ...]:
+        """Where everything is that is shown, to the last bit, and the lights. In a model with other things than geoms
+        the whole pose stands for them."""
+        model, data = self._model, self._data
+        gone = [self._number(name) for name in without if not self._is_soft(name)]
+        shown = (model.geom_group != REMOVED_GROUP) & ((model.geom_group != PANEL_GROUP) | panel)
+        shown[gone] = False
+        places = (data.geom_xpos[shown], data.geom_xmat[shown], data.light_xpos, data.light_xdir)
+        more = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)
+        return (*(values.tobytes() for values in places), more.tobytes())
+
+    def _place(self) -> None:
+        """Where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no dynamics)."""
+        import mujoco
+
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
+            step(self._model, self._data)
+
+    def _read(self) -> None:
+        """Fetch the off-screen buffer. Read directly: 30 times faster than mjr_readPixels, and cheaper to turn and to
+        strip of alpha once it is small."""
+        from OpenGL import GL
+
+        GL.glReadBuffer(GL.GL_COLOR_ATTACHMENT0)
+        GL.glReadPixels(0, 0, self._width, self._height, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE, self._pixels)

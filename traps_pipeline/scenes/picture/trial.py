@@ -1,0 +1,81 @@
+"""Draw a frame and encode a clip, to see whether this machine can."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.workers import run_in_order
+
+OPENGL = ("MUJOCO_GL", "PYOPENGL_PLATFORM")  # variables that choose what draws
+
+
+def draw_frame() -> str:
+    """Draw a red ball; return what drew it. Raises TrapsError, which names the variables that choose OpenGL."""
+    import numpy as np
+
+    try:
+        from traps_pipeline.scenes.physics.kit import Physics, View, add_ball, new_spec
+        from traps_pipeline.scenes.picture.camera import fit_camera
+        from traps_pipeline.scenes.picture.render import Renderer, gl_version
+
+        spec = new_spec(Physics())
+        add_ball(spec, "ball", (0, 0, 0.1), 0.1, "red")
+        model = spec.compile()
+        with Renderer(model, fit_camera(View(), np.array([[-0.3, 0, 0], [0.3, 0, 0.4]]))) as renderer:
+            frame = next(renderer.frames([model.qpos0]))
+            version = gl_version()
+    except Exception as error:
+        raise TrapsError(_unusable(f"{error.__cause__ or error}")) from error
+    red = int((frame[..., 0].astype(int) - frame[..., 1] > 60).sum())
+    if red < 100:
+        raise TrapsError(_unusable(f"a red ball was drawn with {red} red pixels"))
+    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, {version}, one frame drawn ({red} red pixels of the ball)"
+
+
+def _unusable(reason: str) -> str:
+    chosen = ", ".join(f"{name}={os.environ[name]}" for name in OPENGL if name in os.environ)
+    return (
+        f"this machine cannot render clips with {chosen} ({' '.join(reason.split())[:300]}): unset these variables "
+        "and, on Debian, apt-get install libosmesa6"
+    )
+
+
+def encode_clip() -> str:
+    """Encode three frames and read them back. Raises TrapsError."""
+    import numpy as np
+
+    from traps_pipeline.scenes.picture.encode import decode, encode
+
+    frames = [np.full((360, 480, 3), shade, np.uint8) for shade in (40, 80, 120)]
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            encode(frames, Path(folder) / "probe.mp4", fps=10)
+            decoded, _ = decode(Path(folder) / "probe.mp4")
+    except Exception as error:
+        raise TrapsError(f"this machine cannot encode clips ({error}): reinstall the pinned av") from error
+    if len(decoded) != len(frames):
+        raise TrapsError(f"{len(decoded)} of {len(frames)} frames came back; reinstall the pinned av")
+    return "H.264 written and read back"
+
+
+def check_rendering() -> None:
+    """Draw and encode in a process of its own, as a run does: a driver that fails may end it. Raises TrapsError."""
+    try:
+        ((_, problem),) = run_in_order(_problem, [None], workers=1)
+    except BrokenProcessPool:
+        problem = _unusable("the process that drew ended at once")
+    if problem:
+        raise TrapsError(problem)
+
+
+def _problem(_: None) -> str:
+    try:
+        draw_frame()
+        encode_clip()
+    except TrapsError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,57 @@
+"""Solid things that are not drawn, and by which drawn edges a viewer knows of them.
+
+A thing that turns round where nothing is to be seen breaks the physics that a viewer can reckon with. So a wall that
+is not drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies
+parallel to the picture needs none: it stops only what would come towards the eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.scenes.picture.camera import Camera
+
+if TYPE_CHECKING:
+    import mujoco
+
+FACES_THE_EYE_DEG = 25.0  # a pane whose normal is no further off the line of sight lies parallel to the picture
+TOUCHES_M = 0.01  # an edge is no further from its wall
+
+
+def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping[str, tuple[str, ...]]:
+    """Each solid geom that is not drawn and does not lie parallel to the picture, by name, with the names of what shows
+    it: things that do not move, are drawn, touch it, and stop nothing themselves.
+
+    qpos: a pose, (nq,); what is returned is at rest in all poses."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    solid = (model.geom_contype | model.geom_conaffinity) != 0
+    still = model.body_weldid[model.geom_bodyid] == 0
+    drawn = model.geom_rgba[:, 3] > 0
+    edges = np.flatnonzero(still & drawn & ~solid)
+    found: dict[str, tuple[str, ...]] = {}
+    for wall in np.flatnonzero(solid & ~drawn):
+        if _faces_the_eye(model, data, camera, int(wall)):
+            continue
+        near = [
+            int(edge)
+            for edge in edges
+            if mujoco.mj_geomDistance(model, data, int(wall), int(edge), 2 * TOUCHES_M, np.zeros(6)) < TOUCHES_M
+        ]
+        found[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in near)
+    return found
+
+
+def _faces_the_eye(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, geom: int) -> bool:
+    """Whether a geom is a pane, parallel to the picture, that is nearer to the eye than the scene's middle."""
+    normal = data.geom_xmat[geom].reshape(3, 3)[:, int(np.argmin(model.geom_size[geom]))]
+    forward = camera.axes()[2]
+    is_parallel = abs(normal @ forward) > np.cos(np.radians(FACES_THE_EYE_DEG))
+    is_before = (data.geom_xpos[geom] - np.array(camera.lookat)) @ forward < 0
+    return bool(is_parallel and is_before)

@@ -1,0 +1,1 @@
+"""Further clips and questions of a scenario: arms and variations."""

@@ -1,0 +1,459 @@
+"""Arms: further clips and questions of a scenario, each of which takes one shortcut away (docs/arms.md).
+
+A shortcut tells control from void without looking at what happens: a panel in the first frame, a short clip, a question
+without choices. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be answered
+can be answered, and what must be abstained on cannot. Not every scenario admits every arm; `Rejected` says why. What
+an arm shows of a control it shows as if no panel closed it: it differs from the pair in what it takes away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.base.partitions import arms_of, sides_of
+from traps_pipeline.scenes.certification.certificates import (
+    EARLIEST_CUT_S,
+    legible_groups,
+    settled_answer,
+    shown_points,
+)
+from traps_pipeline.scenes.parts.offers import with_choices, without_choices
+from traps_pipeline.scenes.parts.wording import refutation
+from traps_pipeline.scenes.physics.kit import View
+from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
+from traps_pipeline.scenes.picture import checks
+from traps_pipeline.scenes.picture.camera import HEIGHT, PANEL_HALF_THICKNESS, WIDTH, Camera, Panel, fit_camera
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms, moving_geoms
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.scenes.worlds.world import World
+
+# --- thresholds -------------------------------------------------------------------------------------------------------
+
+SHOWN_AGAIN_S = 1.0  # before the end the panel of `removed` goes
+SEEN_PX = 150.0  # of what must be seen of a moving thing, or must differ between two worlds, in one sampled frame
+PANEL_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
+EARLIEST_COVER_S = 0.5  # the late panel comes no earlier
+AGREE_SHARE = 0.95  # of the futures of a predictable cut
+FUTURES = 64  # of the last frame that it shows
+LEADS = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
+BEYOND_PX = 4.0  # what is out of the frame is so far out of it
+SHADOW_FRAMES = 2
+BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A record with its two worlds, and the frames that several arms need."""
+
+    spec: SceneSpec
+    control: World
+    twin: World
+
+    @staticmethod
+    def of_record(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray) -> Scenario:
+        """The scenario of a record and its trajectories, each (F, nq)."""
+        return Scenario(spec, World.of_record(spec, qpos), World.of_record(spec, twin, twin=True))
+
+    @property
+    def fps(self) -> int:
+        """Frames a second."""
+        return self.control.physics.fps
+
+    @cached_property
+    def control_frames(self) -> list[np.ndarray]:
+        """The control as it is drawn without the panel that may close it."""
+        with self.control.renderer() as renderer:
+            return list(renderer.frames(self.control.qpos))
+
+    @cached_property
+    def twin_frames(self) -> list[np.ndarray]:
+        """The other world, as it is drawn when nothing hides it."""
+        with self.twin.renderer() as renderer:
+            return list(renderer.frames(self.twin.qpos))
+
+    @property
+    def void_frames(self) -> list[np.ndarray]:
+        """The void: with its panel, or up to its cut."""
+        if self.control.panel is not None:
+            return self.control.void_frames
+        return self.control_frames[: self.spec.void["cut_frame"]]
+
+    @property
+    def sampled(self) -> slice:
+        """The frames that the 5 FPS sample shows."""
+        return slice(0, None, self.fps // checks.SAMPLED_FPS)
+
+
+@dataclass(frozen=True)
+class Take:
+    """What an arm shows, and the numbers behind its certificate."""
+
+    frames: list[np.ndarray]
+    evidence: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Question:
+    """What an arm asks. side: `control` if it must be answered, `void` if it must be abstained on.
+
+    clip: that of the pair (`control`, `void` or `twin`) which is shown; None where it is the arm's own. labels: the
+    answers to choose from; None where they are the record's.
+    """
+
+    side: str
+    text: str
+    answer: str | None
+    clip: str | None = None
+    labels: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One arm; `partitions.arms_of` says which scenarios may have it, `partitions.sides_of` what it asks.
+
+    takes_away: the shortcut that it turns against its user. promises: its certificate in words.
+
+    film(scenario): the clip; without frames where it is the pair's own. ask(spec): its questions. Both raise Rejected.
+    """
+
+    name: str
+    takes_away: str
+    promises: str
+    ask: Callable[[SceneSpec], list[Question]]
+    film: Callable[[Scenario], Take]
+
+
+def must_answer(spec: SceneSpec) -> list[Question]:
+    """The record's question of the arm's own clip, to be answered."""
+    return [Question("control", spec.question, spec.ground_truth)]
+
+
+def must_abstain(spec: SceneSpec) -> list[Question]:
+    """The record's question of the arm's own clip, to be abstained on."""
+    return [Question("void", spec.question, None)]
+
+
+# --- a panel that hides nothing, or not for good ----------------------------------------------------------------------
+
+
+def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Panel]:
+    """Places for the void's own panel where it may hide nothing: behind everything, then beside it."""
+    panel, control = scenario.control.panel, scenario.control
+    assert panel is not None, "an occlusion scenario has a panel"
+    azimuth = np.radians(control.camera.azimuth_deg)
+    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    centre, half = np.array(panel.centre), panel.half[0]
+    low, high = float((points @ across).min()), float((points @ across).max())
+    behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + PANEL_HALF_THICKNESS
+    at = float(centre @ across)
+    for aside in (0.0, high - at, low - at):
+        yield _moved(panel, ahead * behind + across * aside)
+    for aside in (high + half + BEHIND_M - at, low - half - BEHIND_M - at):
+        yield _moved(panel, across * aside)
+
+
+def _moved(panel: Panel, by: np.ndarray) -> Panel:
+    x, y, z = (round(float(value), 6) for value in np.array(panel.centre) + by)
+    return replace(panel, centre=(x, y, z))
+
+
+def _decoy(scenario: Scenario) -> Take:
+    control, spec = scenario.control, scenario.spec
+    points = shown_points(control.model, control.scene, control.qpos)
+    view = View(control.camera.azimuth_deg, control.camera.elevation_deg, control.camera.fovy_deg)
+    reason = ""
+    for panel in _decoys(scenario, points):
+        camera = fit_camera(view, np.concatenate([points, panel.corners()]))
+        model, scene = compile_scene(control.family, control.params, control.physics, panel)
+        geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
+        groups = legible_groups(control.family, model, scene, control.motion, control.params)
+        sampled = control.qpos[scenario.sampled]
+        with Renderer(model, camera) as renderer:
+            shown = float(renderer.visible_pixels(sampled[:1], ["cover_panel"], panel=True)[0, 0])
+            without, beside = (renderer.visible_pixels(sampled, geoms, panel=there) for there in (False, True))
+            hidden = float(np.abs(without - beside).sum())
+            least = checks.least_visible(renderer, sampled[-3:], groups)
+            small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
+            if shown < PANEL_PX or hidden or small:
+                reason = (
+                    f"the decoy shows {shown:.0f} pixels, hides {hidden:.0f}, leaves {small or 'enough'} to be seen"
+                )
+                continue
+            evidence = {"panel_px": shown, "hides_px": hidden, "least_visible_px": min(least), "panel": vars(panel)}
+            return Take(list(renderer.frames(control.qpos, panel=True)), evidence)
+    raise Rejected(f"{spec.scenario_id}: no place for a panel that hides nothing ({reason})")
+
+
+def _removed(scenario: Scenario) -> Take:
+    spec, at = scenario.spec, len(scenario.control.qpos) - round(SHOWN_AGAIN_S * scenario.fps)
+    commit = scenario.control.outcome.commit_frame
+    last_seen = checks.last_sampled(len(scenario.control.qpos), scenario.fps)[0]
+    if spec.void["hidden_from_frame"] >= at or commit > last_seen or last_seen < at:
+        raise Rejected("the outcome is not both hidden before the panel goes and settled after it")
+    order = scenario.control.outcome.in_order
+    if order is not None and order[0] < at:
+        raise Rejected("the first of the two events that are asked about happens behind the panel")
+    frames = [*scenario.void_frames[:at], *scenario.control_frames[at:]]
+    return Take(frames, {"hidden_until_s": at / scenario.fps, "settled_s": commit / scenario.fps})
+
+
+def _late_panel(scenario: Scenario) -> Take:
+    """The panel comes in the last frame before the outcome is settled."""
+    at = scenario.control.outcome.commit_frame - 1
+    if at < EARLIEST_COVER_S * scenario.fps:
+        raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
+    before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
+    pairs = zip(scenario.control_frames[before], scenario.twin_frames[before], strict=True)
+    differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
+    if differing < SEEN_PX:
+        raise Rejected(f"before the panel comes the two worlds differ in {differing} pixels, {SEEN_PX:.0f} are wanted")
+    frames = [*scenario.control_frames[:at], *scenario.void_frames[at:]]
+    return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": differing})
+
+
+# --- no panel, and still nothing to be seen ---------------------------------------------------------------------------
+
+
+def _looking_past(camera: Camera, corners: np.ndarray) -> Iterator[Camera]:
+    """Cameras that stand a little to one side, so that all corners (N, 3) lie out of the frame."""
+    right, up, forward = camera.axes()
+    focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
+    depth = (corners - camera.position()) @ forward
+    x, y = camera.project(corners).T
+    shifts = (
+        (right, float(((x + BEYOND_PX) * depth / focal).max())),
+        (right, -float(((WIDTH + BEYOND_PX - x) * depth / focal).max())),
+        (up, -float(((y + BEYOND_PX) * depth / focal).max())),
+    )
+    for axis, by in shifts:
+        a, b, c = (round(float(value), 6) for value in np.array(camera.lookat) + by * axis)
+        yield replace(camera, lookat=(a, b, c))
+
+
+def _frame_out(scenario: Scenario) -> Take:
+    control, twin = scenario.control, scenario.twin
+    cover, commit = control.scene.cover, control.outcome.commit_frame
+    assert cover is not None, "an occlusion scene says what its panel must hide"
+    model, scene = compile_scene(control.family, control.params, control.physics)
+    other, _ = compile_scene(twin.family, twin.params, twin.physics)
+    decisive, hidden = decisive_geoms(model, scene.decisive), scene.hidden
+    moving = moving_geoms(model)
+    reason = "no camera was tried"
+    for camera in _looking_past(control.camera, cover.corners()):
+        with Renderer(model, camera) as renderer:
+            counts = renderer.visible_pixels(control.qpos, [*decisive, *hidden])
+            cause = float(renderer.visible_pixels(control.qpos[:1], moving).sum())
+            seen = checks.PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
+            first = seen.hidden_from()
+            if cause < SEEN_PX or first + SHADOW_FRAMES >= commit or seen.leaked(first):
+                reason = (
+                    reason if cause < SEEN_PX else f"the outcome shows for {first} frames, or {seen.leaked(first)} px"
+                )
+                continue
+            first += SHADOW_FRAMES  # a shadow leaves the frame after what throws it
+            traces = checks.ablation_pixels(renderer, control.qpos[first:], [*decisive, *hidden])
+            frames = list(renderer.frames(control.qpos))
+        with Renderer(other, camera) as renderer:
+            differing, _ = checks.differing_pixels(frames, renderer.frames(twin.qpos))
+        if traces or differing:
+            reason = f"{traces} pixels of shadow are seen, the twin differs in {differing}"
+            continue
+        evidence = {"cause_px": cause, "hidden_from_s": first / scenario.fps, "twin_px": differing}
+        return Take(frames, evidence | {"ablation_px": traces, "lookat": list(camera.lookat)})
+    raise Rejected(f"no camera sees something move and not the outcome ({reason})")
+
+
+# --- length -----------------------------------------------------------------------------------------------------------
+
+
+def _length_matched(scenario: Scenario) -> Take:
+    """The control's last frames before it closes, as many as the void has; the observer answers from them."""
+    spec, family, end = scenario.spec, scenario.control.family, scenario.control.open_frames
+    frames = scenario.control_frames[end - spec.void["cut_frame"] : end]
+    assert family.observe is not None, f"{family.name}: has no observer"
+    seen = family.observe(np.stack(frames[scenario.sampled]), spec.question)
+    if seen != spec.ground_truth:
+        raise Rejected(f"the observer sees {seen!r} in the last {len(frames)} frames, the answer is not")
+    return Take(frames, {"frames": len(frames), "observed": seen})
+
+
+def _held_void(scenario: Scenario) -> Take:
+    """The void, its last frame held until the control ends."""
+    void = scenario.void_frames
+    held = len(scenario.control.qpos) - len(void)
+    return Take([*void, *[void[-1]] * held], {"held_s": held / scenario.fps})
+
+
+def _predictable_cut(scenario: Scenario) -> Take:
+    """A cut shortly before the outcome is settled at which nearly all futures of the last frame shown agree with it."""
+    control, commit = scenario.control, scenario.control.outcome.commit_frame
+    if not control.same_physics:
+        raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
+    for frame in (commit - lead for lead in LEADS if commit - lead > EARLIEST_CUT_S * scenario.fps):
+        agree = _agreeing(scenario, frame - 1)
+        if agree is not None:
+            evidence = {"cut_s": frame / scenario.fps, "settled_s": commit / scenario.fps, "agree": agree}
+            return Take(scenario.control_frames[:frame], evidence | {"futures": FUTURES})
+    raise Rejected("no cut before the outcome is settled leaves it nearly certain")
+
+
+def _agreeing(scenario: Scenario, frame: int) -> int | None:
+    """How many of FUTURES futures of the state in a frame, perturbed by the family's scale, end in the answer; None as
+    soon as they are too few."""
+    import mujoco
+
+    control, spec = scenario.control, scenario.spec
+    built = control.family.build(control.params, control.physics)
+    model, substeps = built.spec.compile(), control.physics.substeps
+    data = mujoco.MjData(model)
+    data.qvel[:] = initial_velocity(model, built.velocity)
+    mujoco.mj_step(model, data, frame * substeps)
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    rng = np.random.default_rng([spec.seed, frame, FUTURES])
+    trajectory, disagree = np.array(control.qpos, float), 0
+    for _ in range(FUTURES):
+        mujoco.mj_setState(model, data, state, kind)
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(scale=control.family.perturbation, size=model.nv), 1.0)
+        for row in trajectory[frame + 1 :]:
+            mujoco.mj_step(model, data, substeps)
+            row[:] = data.qpos
+        labels = control.family.outcome(replay(model, trajectory, control.physics), control.params).labels
+        disagree += labels[-1] != spec.ground_truth
+        if disagree > (1 - AGREE_SHARE) * FUTURES:
+            return None
+    return FUTURES - disagree
+
+
+# --- the other world, other words -------------------------------------------------------------------------------------
+
+
+def _twin_answers(spec: SceneSpec) -> list[Question]:
+    return [Question("control", spec.question, spec.twin.ground_truth, clip="twin")]
+
+
+def _twin(scenario: Scenario) -> Take:
+    answer = settled_answer(scenario.twin)
+    if answer != scenario.spec.twin.ground_truth:
+        raise Rejected(f"the twin ends in {answer!r}, the record says {scenario.spec.twin.ground_truth!r}")
+    return Take([], {"settled_s": scenario.twin.outcome.commit_frame / scenario.fps})
+
+
+def _choices_swapped(spec: SceneSpec) -> list[Question]:
+    plain, offering = without_choices(spec.question, tuple(spec.labels)), with_choices(spec.ill_posed_question)
+    if plain is None or offering is None:
+        which = spec.question if plain is None else spec.ill_posed_question
+        raise Rejected(f"the choices of {which!r} cannot be taken from it, or none are known for it")
+    return [
+        Question("control", plain, spec.ground_truth, clip="control"),
+        Question("void", offering, None, clip="control"),
+    ]
+
+
+def _words_alone(scenario: Scenario) -> Take:
+    spec = scenario.spec
+    void = next(question for question in _choices_swapped(spec) if question.side == "void")
+    why = refutation(spec.taxonomy, void.text, scenario.control.inventory)
+    if why is None:
+        raise Rejected(f"nothing shows that {void.text!r} has no answer")
+    return Take([], {"ill_posed_for": why})
+
+
+# --- all of them ------------------------------------------------------------------------------------------------------
+
+ARMS: Mapping[str, Arm] = {
+    arm.name: arm
+    for arm in (
+        Arm(
+            "decoy",
+            "a panel means: abstain",
+            f"the void's own panel stands behind or beside the scene with at least {PANEL_PX:.0f} pixels, takes no "
+            "pixel of a decisive body or the hidden element in any sampled frame, and the outcome stays legible",
+            must_answer,
+            _decoy,
+        ),
+        Arm(
+            "removed",
+            "a panel in the first frames means: abstain",
+            f"the panel stands as in the void until {SHOWN_AGAIN_S} s before the end; the last three sampled frames "
+            "are the control's, with the outcome settled; which of two events was first is not asked",
+            must_answer,
+            _removed,
+        ),
+        Arm(
+            "late_panel",
+            "a panel at the end means: abstain",
+            "up to the last frame before the outcome is settled the control is seen, and some sampled frame of it "
+            f"differs from the other world's in at least {SEEN_PX:.0f} pixels, so that what follows can be inferred",
+            must_answer,
+            _late_panel,
+        ),
+        Arm(
+            "length_matched",
+            "a short clip means: abstain",
+            "the control's last frames before it closes, as many as the void has, from which the observer answers "
+            "rightly",
+            must_answer,
+            _length_matched,
+        ),
+        Arm(
+            "predictable_cut",
+            "a cut means: abstain",
+            f"the control is cut up to {LEADS[0]} frames before its outcome is settled, where at least "
+            f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
+            must_answer,
+            _predictable_cut,
+        ),
+        Arm(
+            "twin_control",
+            "the scene's visible part, or the commonest answer, tells the outcome",
+            "the other world behind the same void, uncovered: its outcome is settled, and is another",
+            _twin_answers,
+            _twin,
+        ),
+        Arm(
+            "frame_out",
+            "no panel means: answer",
+            "the camera looks past the outcome: what moves is seen at first with at least "
+            f"{SEEN_PX:.0f} pixels, then no decisive body, the hidden element never, no shadow of either, and the twin "
+            "has the same frames byte for byte",
+            must_abstain,
+            _frame_out,
+        ),
+        Arm(
+            "held_void",
+            "a long clip means: answer",
+            "the void's frames, the last one held until the control's length: nothing is shown that the void does not "
+            "show",
+            must_abstain,
+            _held_void,
+        ),
+        Arm(
+            "choices_swapped",
+            "a question without choices means: abstain",
+            "the control with its question, whose choices are taken away, and with its ill-posed question, which "
+            "offers some: the vocabulary still refutes it",
+            _choices_swapped,
+            _words_alone,
+        ),
+    )
+}
+
+
+def table() -> str:
+    """The arms as the Markdown table of `docs/arms.md`."""
+    lines = ["| arm | of | asks | takes away | certificate |", "| --- | --- | --- | --- | --- |"]
+    for arm in ARMS.values():
+        of = [taxonomy for taxonomy in ("occlusion", "chaotic") if arm.name in arms_of(taxonomy)]
+        asks = {"control": "must be answered", "void": "must be abstained on"}
+        asked = ", ".join(asks[side] for side in sides_of(arm.name))
+        lines.append(f"| `{arm.name}` | {', '.join(of)} | {asked} | {arm.takes_away} | {arm.promises} |")
+    return "\n".join(lines)

@@ -1,0 +1,267 @@
+"""Variations: the pairs with one thing changed, step by step, for what the paper supposes and did not measure.
+
+docs/hypotheses.md says what each is for. What varies the question or the way it is put shows the pair's own clips; what
+varies the panel is drawn and certified here. A panel that lets the outcome through makes no void, and is not asked as
+one. Not every scenario admits every variation; `Rejected` says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
+from traps_pipeline.scenes.certification.certificates import legible_groups
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.parts.wording import asked, choices_in
+from traps_pipeline.scenes.physics.kit import listed
+from traps_pipeline.scenes.picture import checks
+from traps_pipeline.scenes.picture.policies import shown_at_end
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
+from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, moving_geoms
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.scenes.worlds.world import World
+
+# --- thresholds -------------------------------------------------------------------------------------------------------
+
+NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through a panel
+WIDER = 1.4  # by which the large panel is wider: a higher one would hide the flags of what the question names
+GREY, MAGENTA = (0.55, 0.55, 0.57), (1.0, 0.0, 1.0)  # a colour near the floor's; one that nothing in any scene has
+END_S = 0.5  # of the control's end, in which frames shown later must show the outcome
+PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colours that may be offered as answers
+
+# --- how many answers there are to choose from ------------------------------------------------------------------------
+
+
+def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
+    """The scenario's question with so many choices, and these.
+
+    The answer and that of the twin, the other world behind the same void, are always among them, so that the void stays
+    open; then come the question's own choices, and then colours that it does not name. Raises Rejected where the
+    answers are no colours, or the choices are part of the sentence.
+    """
+    if spec.answer_type != "colour":
+        raise Rejected(f"the answers {listed(spec.labels)} are no colours, so that no others can be offered")
+    named = asked(get_family(spec.family).questions, spec.question)
+    if named is None or set(choices_in(named.get("choices", ""))) != set(spec.labels):
+        raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
+    others = [colour for colour in PALETTE if colour not in named.values()]
+    pool = [spec.ground_truth, spec.twin.ground_truth, *_mixed(spec, spec.labels), *_mixed(spec, others)]
+    labels = _mixed(spec, [*dict.fromkeys(pool)][:count])
+    if len(labels) < count:
+        raise Rejected(f"there are {len(labels)} answers to choose from, {count} are wanted")
+    return spec.question.replace(named["choices"], listed(labels)), tuple(labels)
+
+
+def _mixed(spec: SceneSpec, labels: Sequence[str]) -> list[str]:
+    """The labels in an order that the scenario and nothing else decides."""
+    return sorted(labels, key=lambda label: digest([spec.scenario_id, label]))
+
+
+def _labels(count: int) -> Callable[[SceneSpec], list[Question]]:
+    def ask(spec: SceneSpec) -> list[Question]:
+        for wanted in (2, 3, 6):  # asked with all numbers of choices or with none, so that doses compare
+            with_labels(spec, wanted)
+        question, labels = with_labels(spec, count)
+        return _both(question, spec.ground_truth, labels)
+
+    return ask
+
+
+def _both(question: str, answer: str, labels: tuple[str, ...] | None = None) -> list[Question]:
+    """A question of both clips of the pair."""
+    return [
+        Question("control", question, answer, "control", labels),
+        Question("void", question, None, "void", labels),
+    ]
+
+
+def _pair(spec: SceneSpec) -> list[Question]:
+    return _both(spec.question, spec.ground_truth)
+
+
+def _nothing(scenario: Scenario) -> Take:
+    return Take([], {})
+
+
+def _offered(scenario: Scenario) -> Take:
+    """Two worlds behind one void have different answers, and both are offered."""
+    return Take([], {"offered": [scenario.spec.ground_truth, scenario.spec.twin.ground_truth]})
+
+
+# --- the panel --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a panel looks. colour: RGB in [0, 1], None for the panel's own; alpha: 1 is opaque; wide: in terms of its
+    own width."""
+
+    colour: tuple[float, float, float] | None = None
+    alpha: float = 1.0
+    wide: float = 1.0
+
+
+def _renderer(world: World, look: Look) -> Renderer:
+    """A renderer of a world whose panel has another look, from the pair's camera."""
+    assert world.panel is not None, "an occlusion scenario has a panel"
+    across, thickness, up = world.panel.half
+    panel = replace(world.panel, half=(round(across * look.wide, 6), thickness, up))
+    model, _ = compile_scene(world.family, world.params, world.physics, panel)
+    geom = model.geom("cover_panel")
+    if look.colour is not None:
+        geom.matid[:], geom.rgba[:3] = -1, look.colour  # of one colour, whatever the panel is of
+    geom.rgba[3] = look.alpha
+    return Renderer(model, world.camera)
+
+
+def _void_with(scenario: Scenario, look: Look) -> Take:
+    """The void with another panel, if nobody can tell it from the other world's: an opaque panel must give the same
+    frames byte for byte, another one frames of which no pixel differs by NOTICED levels. Raises Rejected."""
+    control, twin = scenario.control, scenario.twin
+    moving = moving_geoms(control.model)
+    with _renderer(control, look) as renderer:
+        frames = list(checks.void_frames(renderer, control.qpos))
+        shown = float(renderer.visible_pixels(control.qpos[:1], ["cover_panel"], panel=True)[0, 0])
+        cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, panel=True).sum(axis=1).max())
+    with _renderer(twin, look) as renderer:
+        differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
+    if levels >= (1 if look.alpha == 1 else NOTICED):
+        raise Rejected(f"behind this panel the two worlds differ in {differing} pixels, by {levels} levels at most")
+    if cause < SEEN_PX:
+        raise Rejected(f"past this panel at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted")
+    evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing, "twin_levels": levels}
+    looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
+    return Take(frames, evidence | looks)
+
+
+def _contrast(void: np.ndarray, control: np.ndarray) -> float:
+    """How far, in CIELAB, a panel is from what it covers: the mean over the pixels of a frame that it changes."""
+    import cv2
+
+    lab = [cv2.cvtColor((frame / 255).astype(np.float32), cv2.COLOR_RGB2LAB) for frame in (void, control)]
+    far = np.linalg.norm(lab[0] - lab[1], axis=2)
+    return round(float(far[far > 0].mean()), 1) if (far > 0).any() else 0.0
+
+
+def _coloured(colour: tuple[float, float, float]) -> Callable[[Scenario], Take]:
+    return lambda scenario: _void_with(scenario, Look(colour=colour))
+
+
+def _large(scenario: Scenario) -> Take:
+    return _void_with(scenario, Look(wide=WIDER))
+
+
+def _sheer(alpha: float) -> Callable[[Scenario], Take]:
+    def film(scenario: Scenario) -> Take:
+        """A panel that lets light through, where it lets the outcome through: what tells the two worlds apart is seen
+        in the last sampled frames. Raises Rejected where it is not."""
+        look, last = Look(alpha=alpha), checks.last_sampled(len(scenario.control.qpos), scenario.fps)
+        with _renderer(scenario.control, look) as renderer:
+            frames = list(checks.void_frames(renderer, scenario.control.qpos))
+        with _renderer(scenario.twin, look) as renderer:
+            others = list(checks.void_frames(renderer, scenario.twin.qpos))
+        far = [np.abs(frames[k].astype(np.int16) - others[k]).max(axis=2) for k in last]
+        noticed, levels = max(int((one >= NOTICED).sum()) for one in far), max(int(one.max()) for one in far)
+        evidence = {"alpha": alpha, "seen_through_px": noticed, "levels": levels}
+        if noticed < SEEN_PX:
+            raise Rejected(
+                f"through a panel of alpha {alpha:g} the two worlds differ by {NOTICED} levels or more in {noticed} "
+                f"pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
+            )
+        return Take(frames, evidence)
+
+    return film
+
+
+# --- which frames are shown -------------------------------------------------------------------------------------------
+
+
+def _later(scenario: Scenario) -> Take:
+    """The frames after those that models are shown at the end show the outcome too, but for those that a panel closes;
+    a void hides it in every frame."""
+    control = scenario.control
+    at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
+    shown = [frame + 1 for frame in at_end]
+    if shown[0] < control.outcome.commit_frame:
+        raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {shown[0]} is shown")
+    groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)
+    with control.renderer() as renderer:
+        least = checks.least_visible(renderer, control.qpos[shown], groups)
+    small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
+    if small:
+        raise Rejected(f"the frames that are shown later show {', '.join(small)} of the outcome")
+    return Take([], {"late_frames": shown, "least_visible_px": min(least)})
+
+
+# --- all of them ------------------------------------------------------------------------------------------------------
+
+_SAME_VOID = (
+    "the other world behind the void gives the same frames byte for byte, at every frame; at least "
+    f"{SEEN_PX:.0f} pixels of what moves are seen past the panel in some sampled frame"
+)
+_FAINT_VOID = (
+    f"a void to the eye, not byte for byte: in no frame does a pixel of the other world's differ by {NOTICED} of 255 "
+    "levels or more; what moves is seen as above"
+)
+_SEEN_THROUGH = (
+    f"not a void: in one of the last three sampled frames the two worlds differ by {NOTICED} of 255 levels or more in "
+    f"at least {SEEN_PX:.0f} pixels"
+)
+_COUNTS = {"labels_two": 2, "labels_three": 3, "labels_six": 6}
+_COLOURED = {"panel_grey": GREY, "panel_magenta": MAGENTA}
+_FAINT = 0.95
+_ALPHAS = {name: int(name.removeprefix("panel_alpha_")) / 100 for name in PANEL_DOSES}
+_CHANGES: Mapping[str, str] = {
+    "panel_grey": "the panel is grey, near the floor's colour",
+    "panel_magenta": "the panel is magenta, which nothing in any scene is",
+    "panel_large": f"the panel is {WIDER:g} times as wide",
+    "panel_alpha_95": f"the panel has alpha {_FAINT:g}",
+    "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
+    "schema_reason": 'it asks for `{"reason", "final_answer"}`: the request of the regime `json`',
+    "schema_abstain": 'it asks for `{"reason", "abstain", "final_answer"}`',
+    "frames_later": "the model's own frames, each one frame of the clip (0.1 s) later",
+    "frames_few": "2 frames a second, 10 of a whole clip",
+    "frames_all": "10 frames a second, all 50 of a whole clip",
+}
+_FILMED: Mapping[str, Callable[[Scenario], Take]] = {
+    **{name: _coloured(colour) for name, colour in _COLOURED.items()},
+    "panel_large": _large,
+    "panel_alpha_95": lambda scenario: _void_with(scenario, Look(alpha=_FAINT)),
+}
+
+
+def _variation(name: str) -> Arm:
+    if name in _COUNTS:
+        count = _COUNTS[name]
+        changes = f"the question offers {count} answers"
+        promise = "the true answer and the other world's are always offered; asked with 2, 3 and 6 or not at all"
+        return Arm(name, changes, promise, _labels(count), _offered)
+    if name in PANEL_LOOKS:
+        promise = _FAINT_VOID if name == "panel_alpha_95" else _SAME_VOID
+        return Arm(name, _CHANGES[name], promise, must_abstain, _FILMED[name])
+    if name in PANEL_DOSES:
+        return Arm(name, f"the panel has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, must_answer, _sheer(_ALPHAS[name]))
+    promises = {
+        "frames_later": f"the last {END_S:g} s as shown then show the settled outcome legibly; a void hides it in all",
+        "frames_few": "that of the pair, which holds for this rate",
+        "frames_all": "that of the pair: nothing is left out",
+    }
+    promise = promises.get(name, "that of the pair: clips and questions are its own")
+    return Arm(name, _CHANGES[name], promise, _pair, _later if name == "frames_later" else _nothing)
+
+
+VARIATIONS: Mapping[str, Arm] = {
+    name: _variation(name) for name in (*_COUNTS, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
+}
+
+
+def table() -> str:
+    """The variations as the Markdown table of `docs/hypotheses.md`."""
+    lines = ["| variation | changes | certificate |", "| --- | --- | --- |"]
+    lines += [f"| `{one.name}` | {one.takes_away} | {one.promises} |" for one in VARIATIONS.values()]
+    return "\n".join(lines)

@@ -1,0 +1,175 @@
+"""The two clips of a scenario, replayed from its frozen trajectory: nothing is simulated here.
+
+Occluder: the void is the same replay with the cover panel drawn. Truncation: the void is a prefix of the control. A
+control that closes has a panel in its last frames; the twin's clip never has one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.files import write_text
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Family, Physics, Scene
+from traps_pipeline.scenes.picture import checks
+from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.picture.encode import DamagedClip, encode, frames_digest
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import compile_scene, decisive_geoms
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.scenes.worlds.world import closing_of
+
+ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What is known of an encoded clip. leaked_pixels: void pixels that anything decisive still has (0, or the panel
+    does not hide): from segmentation of every sampled frame and from ablation; None where there is no panel."""
+
+    file_sha256: str
+    frames_sha256: str
+    n_frames: int
+    fps: int
+    size_bytes: int
+    leaked_pixels: float | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds shown."""
+        return self.n_frames / self.fps
+
+
+_SEAL = "seal"  # of a note: the digest of what else it says
+
+
+def _seal_of(clip: Clip) -> str:
+    return digest(asdict(clip))[:16]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A pair and its twin to render: record, trajectories (F, nq), and where the clips go."""
+
+    spec: SceneSpec
+    qpos: np.ndarray
+    twin_qpos: np.ndarray
+    control: Path
+    void: Path
+    twin: Path
+
+    @property
+    def clips(self) -> tuple[Path, Path, Path]:
+        """All files of the job."""
+        return self.control, self.void, self.twin
+
+
+def note_of(clip: Path) -> Path:
+    """The small JSON beside a clip that says what it is; written after it, so that it vouches for it."""
+    return clip.with_suffix(".json")
+
+
+def read_clip(path: Path) -> Clip | None:
+    """The clip if it is rendered; None if not. Raises DamagedClip when the file is not what its note says."""
+    clip = read_note(path) if path.is_file() else None
+    if clip is not None:
+        check_clip(path, clip.file_sha256, clip.size_bytes)
+    return clip
+
+
+def read_note(path: Path) -> Clip | None:
+    """What the note of a clip says, wherever the clip is; None where there is none. Raises DamagedClip."""
+    if not note_of(path).is_file():
+        return None
+    try:
+        note = json.loads(note_of(path).read_text(encoding="utf-8"))
+        seal = note.pop(_SEAL, None)  # notes of version 0.1.0 have none
+        clip = Clip(**note)
+        if seal not in (None, _seal_of(clip)):
+            raise ValueError("it was altered")
+    except (ValueError, TypeError, AttributeError) as error:
+        raise DamagedClip(f"{note_of(path)}: is not what was written ({error}); delete it and run again") from error
+    return clip
+
+
+def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
+    """Raises DamagedClip, naming the file and the remedy, unless it has that size and digest."""
+    size = path.stat().st_size if path.is_file() else 0
+    if size != size_bytes or file_digest(path) != sha256:
+        raise DamagedClip(
+            f"{path}: is not the clip that was rendered ({size} of {size_bytes} bytes; truncated or altered); "
+            "delete it and run again: it is rendered anew"
+        )
+
+
+def render_pair(job: Job) -> int:
+    """Render and encode what is missing of a pair and its twin; returns how many frames are new in clips.
+
+    The twin's clip is its control: the other world as it is when nothing hides it.
+    """
+    missing = [path for path in job.clips if read_clip(path) is None]
+    if not missing:
+        return 0
+    family, physics, other = get_family(job.spec.family), Physics(**job.spec.physics), job.spec.twin.params
+    drawn = 0
+    if missing != [job.twin] or other is None:
+        drawn += _render_scene(job, family, physics, missing)
+    if job.twin in missing and other is not None:
+        model, _ = compile_scene(family, family.params_from(other), physics)
+        with Renderer(model, Camera.from_record(job.spec.camera)) as renderer:
+            drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
+    return drawn
+
+
+def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
+    """What is missing of control and void, and of a twin that is the same scene from another start."""
+    spec = job.spec
+    panel, closing = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None, closing_of(spec)
+    behind = panel if closing is None else closing.panel
+    model, scene = compile_scene(family, family.params_from(spec.params), physics, behind)
+    drawn, open_frames = 0, len(job.qpos) if closing is None else closing.frame
+    with Renderer(model, Camera.from_record(spec.camera)) as renderer:
+        control: list[np.ndarray] = []
+        if job.control in missing or (panel is None and job.void in missing):
+            control = list(checks.control_frames(renderer, job.qpos, open_frames))
+            drawn += len(control)
+        if job.control in missing:
+            save_clip(job.control, control, physics.fps)
+        if job.void in missing and panel is not None:
+            decisive = decisive_geoms(model, scene.decisive)
+            closed = control[open_frames:]  # behind the same panel: these are not drawn again
+            open_to = len(job.qpos) - len(closed)
+            void = [*renderer.frames(job.qpos[:open_to], panel=True), *closed]
+            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job, void))
+        elif job.void in missing:
+            save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
+        if job.twin in missing and spec.twin.params is None:
+            drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
+    return drawn
+
+
+def _leaked_pixels(
+    renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job, void: Sequence[np.ndarray]
+) -> float:
+    """What the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel hides
+    decisive bodies from hiding on, and the hidden element, without a trace."""
+    step = job.spec.physics["fps"] // checks.SAMPLED_FPS
+    first = job.spec.void["hidden_from_frame"]
+    seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
+    ablated = np.unique(np.linspace(first, len(job.qpos) - 1, ABLATION_FRAMES).astype(int))
+    whole = [void[frame] for frame in ablated]
+    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], whole)
+
+
+def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
+    """Encode frames and write the note that vouches for them; returns how many there are."""
+    encode(frames, path, fps)
+    clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
+    write_text(note_of(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))
+    return len(frames)

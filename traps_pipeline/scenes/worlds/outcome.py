@@ -1,0 +1,96 @@
+"""A compiled scene, what a run of it comes to, and which of its geoms decide that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.scenes.parts.look import paint_panel
+from traps_pipeline.scenes.physics.flexes import flexes
+from traps_pipeline.scenes.physics.kit import PANEL_GROUP, Family, Motion, Physics, Scene, add_box
+from traps_pipeline.scenes.physics.simulate import simulate
+from traps_pipeline.scenes.picture.camera import Panel
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+class Rejected(ValueError):
+    """This makes no valid pair; the message says why."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run comes to, held against nothing yet.
+
+    label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
+    number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order,
+    turns_deg: as in `kit.Reading`.
+    """
+
+    label: str | None
+    commit_frame: int
+    margin_m: float
+    in_order: tuple[int, int] | None = None
+    turns_deg: float | None = None
+
+    @property
+    def answer(self) -> str:
+        """The label. Raises Rejected if the outcome is undecided."""
+        if self.label is None:
+            raise Rejected("the outcome is undecided at the end of the control")
+        return self.label
+
+
+def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
+    """The outcome of a trajectory as the family reads it; `certificates.settled_outcome` also holds it to account."""
+    reading = family.outcome(motion, params)
+    commit = last_run(reading.labels)
+    label = reading.labels[-1]
+    committed = len(reading.labels) if label is None else commit
+    return Outcome(label, committed, float(reading.margin_m), reading.in_order, reading.turns_deg)
+
+
+def last_run(labels: Sequence[str | None]) -> int:
+    """The first frame from which the last label holds to the end."""
+    return next((i + 1 for i in reversed(range(len(labels))) if labels[i] != labels[-1]), 0)
+
+
+def compile_scene(
+    family: Family, params: Any, physics: Physics, panel: Panel | None = None
+) -> tuple[mujoco.MjModel, Scene]:
+    """The compiled model of a scene, with the cover panel (own geom group, collides with nothing) if one is given."""
+    scene = family.build(params, physics)
+    if panel is not None:
+        geom = add_box(scene.spec.worldbody, "cover_panel", panel.centre, panel.half, "navy")
+        half = np.radians(panel.yaw_deg) / 2
+        geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+        paint_panel(scene.spec, geom, params)
+        geom.contype = geom.conaffinity = 0
+        geom.group = PANEL_GROUP
+    return scene.spec.compile(), scene
+
+
+def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
+    """The trajectory of a compiled scene, (F, nq). Raises Rejected if the solver diverges."""
+    try:
+        return simulate(model, scene, physics)
+    except FloatingPointError as error:
+        raise Rejected(str(error)) from error
+
+
+def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the geoms of bodies that move, and of soft bodies."""
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+    return (*(model.geom(int(i)).name for i in moving if model.geom(int(i)).name), *flexes(model))
+
+
+def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
+    """Names of the geoms of some bodies, and of those that are soft."""
+    soft = flexes(model)
+    ids = {model.body(name).id for name in bodies if name not in soft}
+    geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)
+    return (*geoms, *(name for name in soft if name in bodies))

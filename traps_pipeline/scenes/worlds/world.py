@@ -1,0 +1,226 @@
+"""One simulated world as the camera of its pair sees it; what several certificates need of it is computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.flexes import flexes
+from traps_pipeline.scenes.physics.kit import Family, Inventory, Motion, Physics, Scene
+from traps_pipeline.scenes.physics.simulate import replay
+from traps_pipeline.scenes.picture.camera import Camera, Closing, Panel
+from traps_pipeline.scenes.picture.checks import PastPanel, differing_pixels, void_frames
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import (
+    Outcome,
+    compile_scene,
+    decisive_geoms,
+    moving_geoms,
+    read_outcome,
+    simulated,
+)
+from traps_pipeline.scenes.worlds.spec import SceneSpec
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A scene with its trajectory and its shot.
+
+    qpos: the trajectory (F, nq). panel: the cover panel of its void, None where the void is a cut. frame_step: pixel
+    evidence looks at every so many frames. simulated: the trajectory that simulating gives here, where it is known.
+    closing: how the control ends, None if no panel comes.
+    """
+
+    family: Family
+    params: Any
+    physics: Physics
+    qpos: np.ndarray
+    camera: Camera
+    panel: Panel | None
+    frame_step: int = 1
+    simulated: np.ndarray | None = None
+    closing: Closing | None = None
+
+    @staticmethod
+    def of_record(spec: SceneSpec, qpos: np.ndarray, *, twin: bool = False, frame_step: int = 1) -> World:
+        """The control of a record, or its twin, with its trajectory. Raises ValueError for unknown parameters."""
+        family = get_family(spec.family)
+        params = spec.twin.params if twin and spec.twin.params is not None else spec.params
+        return World(
+            family=family,
+            params=family.params_from(params),
+            physics=Physics(**spec.physics),
+            qpos=qpos,
+            camera=Camera.from_record(spec.camera),
+            panel=Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
+            frame_step=frame_step,
+            closing=closing_of(spec),
+        )
+
+    @cached_property
+    def _compiled(self) -> tuple[mujoco.MjModel, Scene]:
+        return compile_scene(self.family, self.params, self.physics, self.panel)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model, panel included."""
+        return self._compiled[0]
+
+    @property
+    def scene(self) -> Scene:
+        """The built scene: the roles of its parts."""
+        return self._compiled[1]
+
+    @property
+    def inventory(self) -> Inventory:
+        """What a viewer can name; needs no trajectory and no compiled model."""
+        return self.family.build(self.params, self.physics).inventory
+
+    @cached_property
+    def closed_model(self) -> mujoco.MjModel:
+        """The compiled model with the panel that closes the control: that of the void, or its own."""
+        if self.closing is None or self.panel is not None:
+            return self.model
+        return compile_scene(self.family, self.params, self.physics, self.closing.panel)[0]
+
+    @property
+    def open_frames(self) -> int:
+        """How many frames the control shows before a panel comes: all of them if none does."""
+        return len(self.qpos) if self.closing is None else self.closing.frame
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Poses of all bodies, replayed."""
+        return replay(self.model, self.qpos, self.physics)
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """What the trajectory comes to."""
+        return read_outcome(self.family, self.motion, self.params)
+
+    @property
+    def outcome_read(self) -> Outcome:
+        """What the frames before the closing come to, by themselves: what there is to be read."""
+        shown, whole = slice(0, self.open_frames), self.motion
+        parts = ({k: v[shown] for k, v in each.items()} for each in (whole.positions, whole.rotations, whole.vertices))
+        return read_outcome(self.family, Motion(whole.times[shown], *parts), self.params)
+
+    @cached_property
+    def resimulated(self) -> np.ndarray:
+        """The trajectory that simulating the scene gives here, (F, nq). Raises Rejected if the solver diverges."""
+        if self.simulated is not None:
+            return self.simulated
+        return simulated(*compile_scene(self.family, self.params, self.physics), self.physics)
+
+    @property
+    def same_physics(self) -> bool:
+        """Whether simulating here gives the trajectory bit by bit."""
+        return np.array_equal(self.resimulated, self.qpos)
+
+    @property
+    def looked_at(self) -> range:
+        """The frames that pixel evidence looks at."""
+        return range(0, len(self.qpos), self.frame_step)
+
+    def renderer(self) -> Renderer:
+        """A renderer of this world; close it before another one is opened."""
+        return Renderer(self.model, self.camera)
+
+    @property
+    def concealed(self) -> tuple[str, ...]:
+        """Names of all geoms that the void must not show: those of decisive bodies and of the hidden element."""
+        return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
+
+    @property
+    def closed_off(self) -> tuple[str, ...]:
+        """Names of all geoms that nothing may be seen of once the control is closed: what is concealed in the void; of
+        a cut scene everything that moves."""
+        return moving_geoms(self.model) if self.panel is None else self.concealed
+
+    @cached_property
+    def geoms(self) -> tuple[str, ...]:
+        """Names of all geoms, in the order of the model, and of all soft bodies, which are drawn like one."""
+        model = self.closed_model
+        return (*(model.geom(i).name for i in range(model.ngeom)), *flexes(model))
+
+    @property
+    def closed_at(self) -> list[int]:
+        """The frames that pixel evidence of the closed control looks at, the last one always among them."""
+        return sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))
+
+    # What is drawn behind the panel, that of the void or the one that closes the control, is needed by several
+    # certificates; each frame is drawn once.
+
+    def behind_panel(self, which: Sequence[int]) -> list[np.ndarray]:
+        """Some frames of the world behind its panel, as they are drawn."""
+        missing = [frame for frame in which if frame not in self._behind]
+        if missing:
+            with self.closed_renderer() as renderer:
+                self._behind.update(zip(missing, void_frames(renderer, self.qpos[missing]), strict=True))
+        return [self._behind[frame] for frame in which]
+
+    @cached_property
+    def _behind(self) -> dict[int, np.ndarray]:
+        return {}
+
+    def pixels_of(self, names: Sequence[str], which: Sequence[int] | None = None) -> np.ndarray:
+        """How many pixels some geoms have together behind the panel, by segmentation, in some frames, or in those that
+        are looked at, (F,)."""
+        which = self.looked_at if which is None else which
+        missing = [frame for frame in which if frame not in self._segmented]
+        if missing:
+            with self.closed_renderer() as renderer:
+                seen = renderer.visible_pixels(self.qpos[missing], self.geoms, panel=True)
+            self._segmented.update(zip(missing, seen, strict=True))
+        columns = [self.geoms.index(name) for name in names]
+        return np.array([self._segmented[frame][columns].sum() for frame in which])
+
+    @cached_property
+    def _segmented(self) -> dict[int, np.ndarray]:
+        return {}
+
+    def ablation_px(self, which: Sequence[int], geoms: tuple[str, ...]) -> int:
+        """How many pixels change behind the panel, over some frames, when geoms are taken away."""
+        missing = [frame for frame in which if (frame, geoms) not in self._ablated]
+        if missing:
+            whole = self.behind_panel(missing)
+            with self.closed_renderer() as renderer:
+                without = void_frames(renderer, self.qpos[missing], without=geoms)
+                for frame, one, other in zip(missing, whole, without, strict=True):
+                    self._ablated[frame, geoms] = differing_pixels([one], [other])[0]
+        return sum(self._ablated[frame, geoms] for frame in which)
+
+    @cached_property
+    def _ablated(self) -> dict[tuple[int, tuple[str, ...]], int]:
+        return {}
+
+    @cached_property
+    def past_panel(self) -> PastPanel:
+        """What is seen past the panel."""
+        decisive = decisive_geoms(self.model, self.scene.decisive)
+        return PastPanel(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
+
+    @property
+    def void_frames(self) -> list[np.ndarray]:
+        """The world with the panel of its void, as it is drawn."""
+        return self.behind_panel(self.looked_at)
+
+    def closed_renderer(self) -> Renderer:
+        """A renderer of this world with the panel that closes the control; close it before another one is opened."""
+        return Renderer(self.closed_model, self.camera)
+
+
+def closing_of(spec: SceneSpec) -> Closing | None:
+    """How the control of a record closes."""
+    if spec.control is None:
+        return None
+    panel = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]
+    return Closing(spec.control["closes_frame"], Panel.from_record(panel))
