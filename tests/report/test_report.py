@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.build.boards import board_of, board_row, tables
+from tests.build.errors import raises
 from traps_pipeline.base.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs, telling_times
@@ -340,7 +341,7 @@ def test_a_contact_sheet_takes_the_first_pairs_of_each_sub_scenario(tmp_path):
     items = pd.DataFrame(rows)
     assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, 1)] == ["dice-0", "plinko-0"]
     assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, None)] == ["dice-0", "plinko-0", "plinko-1"]
-    with pytest.raises(ValueError, match="1 to 80 pairs, not 0"):
+    with raises(ValueError, "report.contact_sheet.chosen_pairs", "80"):
         chosen_pairs(items[items["side"] == "control"], 1)
 
 
