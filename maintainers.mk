@@ -18,7 +18,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs
 	$(BIN)/python bench/cluster_study.py --kill
 	$(BIN)/python bench/cluster_study.py --mechanism --kill --at hidden_states
-	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
+	$(BIN)/python -m pytest tests/cluster/test_ray_runs.py tests/remedies/test_cluster.py
 
 test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
 	$(BIN)/python -m bench.cluster_kills run cap node stopped postgres network head store together

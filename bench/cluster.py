@@ -33,6 +33,7 @@ from bench.cluster_study import NODES, Study
 from bench.cpu_share import is_there, of_cores
 from tests.objectstore import S3
 from tests.postgres import Postgres
+from traps_pipeline.cluster.history import export
 
 ROOT = Path(__file__).resolve().parents[1]
 # One run for each node, which goes through all categories and shares their clips with the other.
@@ -73,6 +74,7 @@ def rendered(study: Study, runs: int) -> tuple[float, list[Run]]:
     if made.returncode:
         raise SystemExit(made.stdout + made.stderr)
     with study.opened() as workspace:
+        export(workspace)
         instance = DagsterInstance.from_config(str(workspace.dagster_home))
         stats = [instance.get_run_stats(run.run_id) for run in instance.get_runs()]
         instance.dispose()

@@ -33,7 +33,8 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 from traps_pipeline.cli.command import OVER_BUDGET
-from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.place import scratch_of
 from traps_pipeline.storage.purse import Purse
 
@@ -182,8 +183,7 @@ def want_together(scene: Scene) -> None:
         study.folder, study.environment | {"TRAPS_SCRATCH": str(study.folder / "other")}, path, study.root, study.until
     )
     with (study.folder / "webserver.log").open("ab") as log:
-        environment = study.environment | {"DAGSTER_HOME": study.home}
-        pages = subprocess.Popen(command, stdout=log, stderr=log, cwd=study.root, env=environment)
+        pages = subprocess.Popen(command, stdout=log, stderr=log, cwd=study.root, env=study.dagster)
     try:
         began = time.monotonic()
         second = other.start_run(*paying(BUDGET_USD))
@@ -227,12 +227,6 @@ KILLS: dict[str, Callable[[Scene], None]] = {
     "stopped": stop_node,
     "network": cut_network, "silent": silence_network, "store": empty_store, "together": want_together,
 }  # fmt: skip
-SEGMENTS = """
-select count(distinct s.id), coalesce(sum(s.rows), 0),
-       (select count(*) from traps.rows r join traps.evaluations e on e.id = r.evaluation where e.study = t.id)
-from traps.studies t left join traps.evaluations e on e.study = t.id
-left join traps.segments s on s.evaluation = e.id where t.name = %s group by t.id
-"""
 
 
 def spent_usd(study: Study) -> dict[str, float]:
@@ -258,10 +252,7 @@ def lose_clips(study: Study) -> int:
         assert isinstance(store, ObjectStore)
         store.look()
         clips = store.below(workspace.root / "clips")
-        for path in clips:
-            row = store._current(path)
-            assert row is not None
-            store.bucket.delete(row.digest)
+        store.bucket.delete([object_name(bytes.fromhex(digest)) for digest in {*store.digests(clips).values()}])
         return len(clips)
 
 
@@ -415,11 +406,6 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
         assert isinstance(workspace.store, ObjectStore)
         logged = {name.split("/")[1] for name, size, _ in workspace.store.bucket.names("logs") if size}
     study.require(bool(logged), f"the store has what {len(logged)} runs printed")
-    import psycopg
-
-    with psycopg.connect(scene.database.address(), autocommit=True) as connection:
-        (found,) = connection.execute(SEGMENTS, [name_of(study)]).fetchall()
-    study.require(found[0] > 0 and found[2] == 0, f"{found[0]} segments hold {found[1]} rows, the database {found[2]}")
 
 
 def _look_at_cap(study: Study, provider: Provider, code: int, said: Sequence[str], wanted: int) -> None:

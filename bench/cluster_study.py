@@ -29,10 +29,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from dagster import DagsterInstance
-
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.orchestration.cluster import require_cluster
+from traps_pipeline.cluster.history import export
+from traps_pipeline.cluster.ray_runs import require_cluster
+from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.storage.place import name_of
 from traps_pipeline.storage.workspace import Workspace
 
@@ -85,6 +85,13 @@ class Study:
             raise RuntimeError(done.stderr)
         return done.stdout
 
+    @property
+    def dagster(self) -> dict[str, str]:
+        """The environment of Dagster's own processes, as `traps ui` starts them."""
+        with self.opened() as workspace:
+            export(workspace)
+            return {**os.environ, "DAGSTER_HOME": self.home}
+
     @contextmanager
     def opened(self) -> Iterator[Workspace]:
         """The study as a process sees it that has this host's variables: this one, within the block."""
@@ -124,9 +131,8 @@ class Study:
         self.home = line.partition("DAGSTER_HOME=")[2]
         with (self.folder / "daemon.log").open("ab") as log:
             command = [sys.executable, "-m", "dagster._daemon", "run", "-m", "traps_pipeline.definitions"]
-            environment = self.environment | {"DAGSTER_HOME": self.home}
-            self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.root, env=environment)
-        with self.opened() as workspace, DagsterInstance.from_config(self.home) as instance:
+            self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.root, env=self.dagster)
+        with self.opened() as workspace, dagster_history(workspace) as instance:
             while True:
                 try:
                     require_cluster(workspace, instance)
@@ -269,8 +275,10 @@ def main() -> None:
 # The database may hold the history of other studies, too. A run that a page launched has no tag of ours while it waits.
 RUNS = """
 from dagster import DagsterEventType as T, DagsterInstance
+from traps_pipeline.cluster.history import export
 from traps_pipeline.storage.workspace import Workspace
 workspace = Workspace.open()
+export(workspace)
 instance = DagsterInstance.from_config(str(workspace.dagster_home))
 mine = workspace.study.name
 runs = [run for run in instance.get_runs() if any(key.path[0] == mine for key in run.asset_selection or ())]

@@ -33,6 +33,7 @@ ROOMS = (
     "defs",
     "definitions",
     "cli",
+    "cluster",
 )
 # The same for what lies in the room of scenes, whose largest rooms are folders.
 SCENES = (
@@ -123,6 +124,25 @@ def test_no_files_import_each_other_in_a_circle() -> None:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" <- ".join(error.args[1]))
+
+
+def test_the_room_for_several_hosts_is_asked_for_in_one_place_and_has_what_is_asked() -> None:
+    """No other room imports it (it stands at the top), and its name is written where it is loaded by name."""
+    naming = [
+        path.relative_to(PACKAGE).as_posix()
+        for module, path in files().items()
+        if room_of(module) != "cluster" and f"{PACKAGE.name}.cluster" in path.read_text(encoding="utf-8")
+    ]
+    assert naming == ["storage/several_hosts.py"]
+    asked, entry = (ast.parse((PACKAGE / path).read_text()) for path in (naming[0], "cluster/entry.py"))
+    (protocol,) = (node for node in asked.body if isinstance(node, ast.ClassDef))
+    functions = [node.name for node in protocol.body if isinstance(node, ast.FunctionDef)]
+    (has,) = (
+        ast.literal_eval(node.value)
+        for node in entry.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+    )
+    assert sorted(functions) == sorted(has) and len(functions) <= 5
 
 
 def test_an_import_counts_in_a_function_and_for_types_too() -> None:

@@ -33,10 +33,11 @@ def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:
     """Items, votes, verdicts and metrics of these VERDICTS rows, as their stages would leave them."""
     tables = workspace.tables
     for dataset, part in verdicts.groupby("dataset"):
-        named = part.drop_duplicates("item_id")[["item_id", "pair_id", "side"]].to_dict("records")
-        tables.write(ITEMS, {"dataset": dataset}, [row(ITEMS, dataset=dataset, **item) for item in named], {})
+        items = part.drop_duplicates("item_id")[["item_id", "pair_id", "side"]].itertuples(index=False)
+        rows = [row(ITEMS, dataset=dataset, item_id=item, pair_id=pair, side=side) for item, pair, side in items]
+        tables.write(ITEMS, {"dataset": dataset}, rows, {})
         for cell, mine in part.groupby(["dataset", "model", "regime", "run"]):
-            where = dict(zip(("dataset", "model", "regime", "run"), cell, strict=True))
+            where = {name: value for name, value in zip(("dataset", "model", "regime", "run"), cell, strict=True)}
             tables.write(VERDICTS, where, mine.reset_index(drop=True), {})
             cast = [
                 row(VOTES, item_id=item, side=side, task="abstention", judge=judge, valid=True, panel=panel_id("rules"),

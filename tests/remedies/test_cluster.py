@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,11 +20,11 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from tests.remedies.test_money import paid
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.orchestration.cluster import require_cluster
+from traps_pipeline.cluster.bucket import Bucket
+from traps_pipeline.cluster.history import HISTORY, LOGS
+from traps_pipeline.cluster.ray_runs import require_cluster
+from traps_pipeline.cluster.same_code import code_here, require_same_code
 from traps_pipeline.orchestration.run import dagster_history
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
-from traps_pipeline.orchestration.shared_history import SharedHistory
-from traps_pipeline.storage.bucket import Bucket
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
@@ -50,12 +49,12 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
 ) -> None:
     s3.empty()
     content = b"frames"
-    remedied(lambda: Bucket(address).put("a", content), "storage.bucket.Bucket.put", s3.make_bucket)
+    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket.Bucket.put", s3.make_bucket)
     assert Bucket(address).get("a") == content
     monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
     found = remedied(
         lambda: Bucket(address).get("a"),
-        "storage.bucket.Bucket.get",
+        "cluster.bucket.Bucket.get",
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
@@ -97,7 +96,7 @@ def test_a_store_of_azure_is_opened_once_its_account_and_key_are_exported(monkey
         monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "lab")
         monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", "a2V5")
 
-    opened = remedied(lambda: Bucket("az://lab/study"), "storage.bucket.Bucket.__init__", export)
+    opened = remedied(lambda: Bucket("az://lab/study"), "cluster.bucket.Bucket.__init__", export)
     assert opened.address == "az://lab/study"
 
 
@@ -172,52 +171,47 @@ def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
                 time.sleep(1)
 
 
-def of_another_host(checkout: Checkout) -> Callable[[], Mapping[str, str]]:
-    """The tags of a run that a host with the code of a checkout submits."""
+def of_another_host(checkout: Checkout) -> Callable[[], str]:
+    """What a host with the code of a checkout says of it."""
 
-    def tags() -> Mapping[str, str]:
-        code = "from traps_pipeline.orchestration.same_code import code_here\nprint(code_here())"
-        said = checkout.run(sys.executable, "-c", code)
-        assert said.code == 0, said.err
-        return {CODE_TAG: said.out.strip()}
+    def code() -> str:
+        program = "from traps_pipeline.cluster.same_code import code_here\nprint(code_here())"
+        printed = checkout.run(sys.executable, "-c", program)
+        assert printed.code == 0, printed.err
+        return printed.out.strip()
 
-    return tags
+    return code
 
 
 def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -> None:
     checkout = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
-    file, tags = checkout.root / "traps_pipeline" / "base" / "digests.py", of_another_host(checkout)
+    file, code = checkout.root / "traps_pipeline" / "base" / "digests.py", of_another_host(checkout)
     ours = file.read_text()
     file.write_text(ours + "# altered on that host\n")
     remedied(
-        lambda: require_same_code(tags(), "lab"),
-        "orchestration.same_code.require_same_code",
+        lambda: require_same_code(code(), "lab"),
+        "cluster.same_code.require_same_code",
         lambda: file.write_text(ours),
     )
-    assert tags() == {CODE_TAG: code_here()}
+    assert code() == code_here()
 
 
-def test_a_worker_whose_password_is_wrong_opens_the_history_once_it_is_right(
-    postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+def test_a_host_whose_password_is_wrong_opens_the_history_once_it_is_right(
+    address: str, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
+    for exported in (HISTORY, LOGS):
+        monkeypatch.setenv(exported, "")  # and as it was after the test
+    monkeypatch.setenv(RAY, "http://127.0.0.1:1")
+    monkeypatch.delenv("DAGSTER_HOME", raising=False)
+    workspace = Workspace.create(address, Study())
     monkeypatch.setenv(DATABASE, postgres.address(password="wrong"))
-    history: Any = remedied(
-        lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
-        "orchestration",
-        lambda: monkeypatch.setenv(DATABASE, postgres.address()),
-    )
-    assert history.run_storage.get_runs() == []
 
+    def runs() -> int:
+        with dagster_history(workspace) as instance:
+            return instance.get_runs_count()
 
-def test_a_host_that_exports_the_database_opens_the_history(
-    postgres: Postgres, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
-    monkeypatch.delenv(DATABASE, raising=False)
-    history: Any = remedied(
-        lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
-        "orchestration",
-        lambda: monkeypatch.setenv(DATABASE, postgres.address()),
+    assert (
+        remedied(runs, "orchestration.run.dagster_history", lambda: monkeypatch.setenv(DATABASE, postgres.address()))
+        == 0
     )
-    assert history.run_storage.get_runs_count() >= 0

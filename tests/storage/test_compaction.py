@@ -20,12 +20,12 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from tests.storage.conftest import VARIABLE
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.objects import Bucket, ObjectStore
 from traps_pipeline.storage import compaction
-from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.compaction import Segment, segments_of
 from traps_pipeline.storage.database import FORMAT, Session
 from traps_pipeline.storage.ledger import Writer
-from traps_pipeline.storage.objects import Bucket, ObjectStore
 from traps_pipeline.storage.shared_ledger import SharedLedger, SharedWriter
 
 FAILED = {"key": "f", "outcome": "error", "error": "timeout", "text": None}

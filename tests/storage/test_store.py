@@ -17,10 +17,11 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import VIDEOS
-from traps_pipeline.storage.bucket import object_name
+from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.database import Database
+from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.leases import alone, leased
-from traps_pipeline.storage.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
 
@@ -70,8 +71,8 @@ def opened(folder: str, *of_database: str) -> Store:
     if not database:
         return FolderStore(Path(folder) / "study")
     address, study = database
-    session = Session(address, "TRAPS_TEST_DATABASE", study)
-    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), session)
+    database = Database(address, Session(address, "TRAPS_TEST_DATABASE", study))
+    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database, study, b"anchor")
 
 
 def put(store: Store, name: str, content: bytes) -> Path:
@@ -262,7 +263,7 @@ def test_an_object_that_was_altered_is_named_and_nothing_is_read_from_it(bucket_
             other.here(there)
         assert not other.has(there)
         one.look()
-        one._there.clear()
+        one._stored.clear()
         put(one, "tables/t/part.parquet", b"whole")
     other.look()
     assert other.here(there).read_bytes() == b"whole"

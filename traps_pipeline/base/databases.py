@@ -14,6 +14,7 @@ _UNWRITABLE = (
     (r"readonly database|read-only file system", "it is read-only", "make its folder writable for this user"),
     (r"disk I/O error|input/output error", "its disk fails or is full", "free some space"),
 )
+_SERVER = r"connection to server|could not translate host name|server closed the connection|terminating connection"
 
 
 def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
@@ -25,4 +26,16 @@ def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):
             return reason, remedy, True
+    if re.search(_SERVER, words, re.IGNORECASE):
+        return words, "see that the server runs and that address, user and password are right on this host", False
     return words or "it gives no reason", "free some space, or move that folder away", False
+
+
+def database_error(error: BaseException) -> BaseException | None:
+    """Return the error of a database that an exception is, or was raised from; None where there is none."""
+    from sqlalchemy.exc import DBAPIError
+
+    current: BaseException | None = error
+    while current is not None and not isinstance(current, DBAPIError):
+        current = current.__cause__
+    return current

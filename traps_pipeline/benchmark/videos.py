@@ -21,7 +21,7 @@ from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, re
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = ("control", "void", "twin")
-SECONDS_A_CLIP = 1.4  # of one core, measured (docs/cluster.md)
+SECONDS_A_CLIP = 1.4  # of one core, measured (docs/design/cluster-results.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:

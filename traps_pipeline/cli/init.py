@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, add_panel, entered, experiment_of, place_of
 
 if TYPE_CHECKING:
@@ -17,20 +18,27 @@ def add(commands: Commands) -> None:
     parser = commands.add("init", init, "make a workspace for an experiment without running it")
     parser.add_argument("experiment", nargs="?", default="demo")
     add_panel(parser)
+    parser.add_argument(
+        "--database",
+        metavar="VARIABLE",
+        help="keep the ledger of a new study in PostgreSQL, for several hosts that share its folder (docs/cluster.md); "
+        "the variable of the environment holds the address",
+    )
 
 
 def init(arguments: argparse.Namespace) -> int:
     """See `traps init --help`."""
-    workspace = create(arguments, experiment_of(arguments))
+    workspace = create(arguments, experiment_of(arguments), arguments.database)
     print(f"workspace {workspace.place} (study.yaml names its benchmark, panel and budget)")
     print(f"next: export TRAPS_WORKSPACE={workspace.place} DAGSTER_HOME={workspace.dagster_home}")
     return OK
 
 
-def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
-    """The workspace that a command names, with the experiment in its study; a missing workspace is made.
+def create(arguments: argparse.Namespace, experiment: Experiment, database: str | None = None) -> Workspace:
+    """Return the workspace that a command names, with the experiment in its study; a missing workspace is made.
 
-    Raises TrapsError if the existing study differs from the one that the experiment needs.
+    database: the variable with the address of the study's database, where one is asked for. Raises TrapsError if the
+    existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.models.own import keep
     from traps_pipeline.storage.workspace import Workspace
@@ -38,7 +46,12 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     place, by_rules = place_of(arguments), arguments.judged_by_rules
     if not Workspace.is_there(place):  # refused before a folder is made
         experiment.judged(None, arguments.panel, judged_by_rules=by_rules)
-    workspace = Workspace.create(place, experiment.study)
+    workspace = Workspace.create(place, experiment.study.model_copy(update={"database": database}))
+    if database is not None and workspace.study.database != database:
+        raise TrapsError(
+            f"{place}/study.yaml: its ledger lies in {workspace.study.database or 'its folder'}; make a new "
+            f"one with --database {database} in another place, and bring the answers along (docs/cluster.md)"
+        )
     judged = experiment.judged(workspace.study, arguments.panel, judged_by_rules=by_rules)
     experiment.check_study(judged, workspace.root / "study.yaml")
     if judged != workspace.study:

@@ -161,11 +161,9 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
     if not arguments.cluster:
         yield RunsHere(instance, defs.resolve_implicit_global_asset_job_def())
         return
-    from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
+    from traps_pipeline.storage.several_hosts import several_hosts
 
-    require_cluster(workspace, instance)
-    given = arguments.runs, arguments.gpus, arguments.on_interrupt, arguments.cpus
-    with RayRuns(instance, workspace, *given) as runs:
+    with several_hosts().runs(workspace, instance, arguments) as runs:
         yield runs
 
 

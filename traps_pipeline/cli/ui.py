@@ -38,8 +38,8 @@ def ui(arguments: argparse.Namespace) -> int:
     token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
         return code if code >= 0 else FAILED
-    from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS
     from traps_pipeline.orchestration.run import dagster_history
+    from traps_pipeline.storage.workspace import RUN_CPUS, RUN_GPUS
 
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
         if value is not None:

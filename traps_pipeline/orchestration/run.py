@@ -14,7 +14,7 @@ import dagster as dg
 import yaml
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.databases import reason_and_remedy
+from traps_pipeline.base.databases import database_error, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
@@ -22,9 +22,9 @@ from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, Runs, this_host
-from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -59,11 +59,14 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
             yield instance
     except BrokenPipeError:
         raise  # of what is printed to
-    except (OSError, *unusable()) as error:
+    except Exception as error:
+        cause = database_error(error)
         if isinstance(error, OSError):
             why, what = error.strerror or "its file cannot be used", remedy(error)
+        elif cause is not None:
+            why, what, _ = reason_and_remedy(cause)
         else:
-            why, what, _ = reason_and_remedy(error)
+            raise
         raise TrapsError(
             f"{home}: Dagster's history cannot be read or written ({why}); {what} and run the same command again: "
             "tables are whole, no answer is lost"
@@ -75,10 +78,8 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
     for again in (False, True):
         if workspace.is_on_cluster and home == workspace.dagster_home:
-            from traps_pipeline.orchestration.cluster import dagster_yaml
-
-            said = yaml.safe_dump(dagster_yaml(str(workspace.study.database), str(workspace.place)), sort_keys=False)
-            write_text(home / "dagster.yaml", said)
+            settings = several_hosts().dagster_yaml(workspace)
+            write_text(home / "dagster.yaml", yaml.safe_dump(settings, sort_keys=False))
         workspace.copy_dagster_yaml(home)
         try:
             instance = dg.DagsterInstance.from_config(str(home))

@@ -1,4 +1,4 @@
-"""How Dagster runs are made: here and now, one after another, or on other hosts (`orchestration/cluster.py`)."""
+"""How Dagster runs are made: here and now, one after another, or on the hosts of a cluster."""
 
 from __future__ import annotations
 

@@ -27,7 +27,6 @@ from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
 from traps_pipeline.orchestration.metadata import preview, visible_metadata
-from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.leases import alone
@@ -100,7 +99,6 @@ class Step:
 
     def _events(self) -> Generator[Event, None, None]:
         stage, name = self.stage, self.stage.name
-        require_same_code(self.context.run.tags, self.workspace.study.name)
         require_machine(self.workspace, parts_of_run(self.context, self.stage, self._wanted))
         lineage = Lineage(self.workspace, thorough=True)
         self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])

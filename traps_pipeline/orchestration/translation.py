@@ -27,7 +27,7 @@ def asset_key(name: str) -> dg.AssetKey:
 @cache
 def _prefix() -> tuple[str, ...]:
     home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
-    if workspace is not None and workspace.is_shared:
+    if workspace is not None and (workspace.is_shared or workspace.is_on_cluster):
         return (workspace.study.name,)  # several studies share its database, and so may share its history
     if workspace is None or not home or Path(home).resolve() == workspace.dagster_home.resolve():
         return ()

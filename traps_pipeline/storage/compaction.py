@@ -14,15 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.database import Claim, Session
 from traps_pipeline.storage.ledger import ASIDES
-from traps_pipeline.storage.removal import removed
 
 if TYPE_CHECKING:
     from psycopg import Connection
 
-    from traps_pipeline.storage.objects import ObjectStore
 
 FETCHED = 2000  # rows of a ledger that are held at once while it is read
 SEGMENT = 20_000  # rows of a segment at most
@@ -49,7 +46,7 @@ def segments_of(connection: Connection[Any], slot: Sequence[Any]) -> list[Segmen
 class Segments:
     """The segments of a study's ledger. store: None where the study lies in a folder, and has none."""
 
-    def __init__(self, session: Session, store: ObjectStore | None, kind: str) -> None:
+    def __init__(self, session: Session, store: Any, kind: str) -> None:
         self._session, self._store, self._kind = session, store, kind
 
     def rows(
@@ -83,7 +80,7 @@ class Segments:
             )
         path, wrong = self._store.content(segment.digest, segment.size)
         return path, wrong and (
-            f"{self._store.bucket.address}/{object_name(segment.digest)}: holds {what}, which were paid for, and "
+            f"{self._store.bucket.address}/{segment.digest.hex()}: holds {what}, which were paid for, and "
             f"{wrong}; put it back from a copy (a host that has read it has one below .objects in its scratch folder) "
             "and run the same command again: none of them is asked meanwhile"
         )
@@ -95,7 +92,7 @@ class Segments:
         while self._store is not None and (written := self._encoded(claim)) is not None:
             content, first, last, rows = written
             digest = self._store.put(content)
-            if (kept := self._store.bucket.get(object_name(digest))) is None or sha256(kept).digest() != digest:
+            if (kept := self._store.bucket.get(digest.hex())) is None or sha256(kept).digest() != digest:
                 return count  # the store does not give back what it took; the rows stay where they are
             segment = Segment(0, digest, len(content), rows)
             if not self._session.run(lambda c, s=segment, f=first, n=last: _release(c, study, claim, s, f, n)):
@@ -127,8 +124,6 @@ class Segments:
 def _release(connection: Connection[Any], study: int, claim: Claim, segment: Segment, first: int, last: int) -> bool:
     """Put a segment in the place of its rows, unless another process is the evaluation's writer by now, or its object
     is being removed; whether it is there. What was committed when the connection broke is not done again."""
-    if removed(connection, study, [segment.digest]):
-        return False
     sql = "select number from traps.evaluations where id = %s for update"
     if connection.execute(sql, [claim.evaluation]).fetchone() != (claim.number,):
         claim.lost = True

@@ -145,7 +145,7 @@ class Session:
                     if is_there and not isinstance(error, psycopg.OperationalError):
                         raise
                     if self.closed or time.monotonic() >= until:
-                        raise TrapsError(self._told(error)) from None  # its arguments hold the password
+                        raise self.unusable(error) from None  # its arguments hold the password
                     time.sleep(RETRY_S)
 
     def _connected(self) -> Connection[Any]:
@@ -214,9 +214,10 @@ class Session:
             with suppress(TrapsError):  # a connection that is gone holds no locks
                 self.run(lambda c: c.execute("select pg_advisory_unlock(%s)", [lock]), patience_s=0.0)
 
-    def _told(self, error: Exception) -> str:
+    def unusable(self, error: BaseException) -> TrapsError:
+        """Return what a person reads where the database cannot be used."""
         said = " ".join(f"{error}".split()) or type(error).__name__
-        return (
+        return TrapsError(
             f"{self._variable}: the database at {self.host} cannot be used from the host {socket.gethostname()} "
             f"({said}); the study {self.study} keeps its ledger there. See that the server runs and that address, user "
             f'and password are right (`psql "${self._variable}"` tries them), then run the same command again: what is '

@@ -48,7 +48,6 @@ from traps_pipeline.storage.stream import (
 if TYPE_CHECKING:
     from psycopg import Connection
 
-    from traps_pipeline.storage.objects import ObjectStore
 
 LOCK_POLL_S = 0.2
 
@@ -57,7 +56,7 @@ class SharedLedger(Ledger):
     """Append-only rows by key in a database, in which each study has its own. store: where rows of finished
     evaluations go; None where they stay."""
 
-    def __init__(self, session: Session, kind: str, store: ObjectStore | None = None) -> None:
+    def __init__(self, session: Session, kind: str, store: Any = None) -> None:
         super().__init__(kind)
         self.session, self.segments = session, Segments(session, store, kind)
 

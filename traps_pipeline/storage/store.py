@@ -1,7 +1,7 @@
 """Where a study's files lie: one interface with two implementations, which what reads and writes files does not tell
 apart (`Workspace.is_shared` does, for what several hosts cannot share).
 
-In a folder of one machine (`FolderStore`), or in an object store that several hosts share (`storage/objects.py`). Code
+In a folder of one machine (`FolderStore`), or in an object store that several hosts share. Code
 names a file by its path below the workspace's folder on this machine, makes it there, and hands it over with `keep`;
 before it reads files that another host may have made, it asks for them with `bring`. In a folder both do nothing.
 """
@@ -13,12 +13,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, try_lock, write_bytes
 
+GRACE_DAYS = 7.0  # an object that nobody names is younger while it is written
 LEASES = ".leases"  # in a study's folder: the files of pieces of work that are under way
 
 
@@ -27,6 +29,15 @@ class Lease:
     """The right to a piece of work, which no other process has until `close` or the end of this process."""
 
     close: Callable[[], None]
+
+
+@dataclass(frozen=True)
+class UnusedObject:
+    """An object in a study's store that nobody names. size: in bytes; at: when it was written, by the store's clock."""
+
+    name: str
+    size: int
+    at: datetime
 
 
 class Store(ABC):
@@ -97,6 +108,14 @@ class Store(ABC):
     @abstractmethod
     def look(self) -> None:
         """See what other hosts have made until now. Without it, what is seen may be half a second old."""
+
+    def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
+        """Return objects that nobody names, the oldest first, and remove them if asked to; a folder has none.
+
+        grace_days: how old they are at least, GRACE_DAYS if None. Raises TrapsError where the store cannot be used, or
+        is another study's.
+        """
+        return []
 
 
 class FolderStore(Store):

@@ -18,13 +18,12 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import ROOT, WORKSPACES, require_root
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.storage.anchor import anchor_of, file_at, store_of, write_anchor
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.objects import ObjectStore
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
 from traps_pipeline.storage.segments import SegmentLedger
+from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
 
 VARIABLE = "TRAPS_WORKSPACE"
 RAY = "TRAPS_RAY"  # holds the address of Ray's head, http://HEAD:8265, where runs go to a cluster
+RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # of runs on a cluster that are launched in Dagster's pages
 DATABASE = "TRAPS_DATABASE"  # the variable with the database's address, where a new study in a store names no other
 
 
@@ -61,14 +61,21 @@ class Workspace:
     @staticmethod
     def is_there(place: Place) -> bool:
         """Whether a study lies there. Raises TrapsError where an object store cannot be used."""
-        return anchor_of(place) is not None if isinstance(place, str) else (place / STUDY).is_file()
+        if isinstance(place, str):
+            return several_hosts().open_store(place, scratch_of(place)) is not None
+        return (place / STUDY).is_file()
 
     @staticmethod
     def file_of(place: Place, name: str) -> Path | None:
         """A file at the top of a study, whether or not it can be opened; None where there is none. Raises TrapsError
         where an object store cannot be used."""
         if isinstance(place, str):
-            return file_at(scratch_of(place), place, name)
+            root = scratch_of(place)
+            store = several_hosts().open_store(place, root)
+            if store is None:
+                return None
+            store.look()
+            return store.here(root / name) if store.has(root / name) else None
         return place.absolute() / name if (place / name).is_file() else None
 
     @classmethod
@@ -89,10 +96,8 @@ class Workspace:
         if isinstance(place, str):
             study = study.model_copy(update={"database": study.database or DATABASE})
             workspace = cls(scratch_of(place), study, place)
-            session_of(study.database or DATABASE, study.name)  # refused before anything is written
             workspace._make_folders()
             workspace.save_study()
-            write_anchor(place, study)  # last, so that it vouches for the study
             return workspace
         workspace = cls(place.absolute(), study)
         workspace._make_folders()
@@ -154,12 +159,15 @@ class Workspace:
     @property
     def is_on_cluster(self) -> bool:
         """Whether runs of this study may go to other hosts, and its history therefore lies in its database."""
-        return bool(self._address and os.environ.get(RAY))
+        return bool(self.study.database and os.environ.get(RAY))
 
     @property
     def dagster_home(self) -> Path:
-        """Dagster's own history (DAGSTER_HOME)."""
-        return self.root / ("cluster" if self.is_on_cluster else "dagster")
+        """Dagster's own history (DAGSTER_HOME). Where several hosts share the folder and their runs do not go to a
+        cluster, each host has one of its own: SQLite does not work on network file systems."""
+        if self.is_on_cluster:
+            return self.root / "cluster"
+        return (scratch_of(str(self.root)) if self.study.database and not self._address else self.root) / "dagster"
 
     @property
     def reports(self) -> Path:
@@ -189,11 +197,11 @@ class Workspace:
     @cached_property
     def store(self) -> Store:
         """The study's files."""
-        if not self._address:
+        if not self.study.database:
             return FolderStore(self.root)
-        session = self.session
-        assert session is not None, "a study in an object store names a database"
-        return store_of(self.root, self._address, session)
+        store = several_hosts().open_store(self.place, self.root, self.study)
+        assert store is not None, "the study is given"
+        return store
 
     @cached_property
     def tables(self) -> TableStore:
@@ -221,7 +229,7 @@ class Workspace:
         shared = self.session
         if shared is None:
             return SegmentLedger(self.ledger_folder, kind)
-        return SharedLedger(shared, kind, self.store if isinstance(self.store, ObjectStore) else None)
+        return SharedLedger(shared, kind)
 
     @property
     def session(self) -> Session | None:

@@ -19,7 +19,6 @@ from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
 from traps_pipeline.orchestration.machine import check_disk
 from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
-from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
 if TYPE_CHECKING:
@@ -140,21 +139,19 @@ def examine_files(place: Place) -> Iterator[Finding]:
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
     """The objects in a study's store that nobody names and that are older than the grace period, and which of them were
     removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be used."""
-    from traps_pipeline.storage.objects import ObjectStore
-    from traps_pipeline.storage.unused import GRACE_DAYS, remove, unused
+    from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
-    store = Workspace.open(place).store
-    if not isinstance(store, ObjectStore):
+    workspace = Workspace.open(place)
+    if not workspace.is_shared:
         raise TrapsError(
             f"{place}: a study in a folder has no objects that nobody names; give the address of one in an object "
             "store with --workspace s3://BUCKET/STUDY"
         )
-    found = unused(store)
-    shown = remove(store, found) if is_removed else found
+    shown = workspace.store.unused(is_removed=is_removed)
     what = f"{len(shown)} objects ({sum(one.size for one in shown) / 1e6:.1f} MB)"
     if shown:
-        what += f", the oldest of {shown[0].at:%Y-%m-%d}: {', '.join(object_name(one.digest) for one in shown[:SHOWN])}"
+        what += f", the oldest of {shown[0].at:%Y-%m-%d}: {', '.join(one.name for one in shown[:SHOWN])}"
         what += ", .." * (len(shown) > SHOWN)
     done = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.anchor import write_anchor
 from traps_pipeline.storage.database import session_of
 from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
@@ -46,8 +45,7 @@ def move_to_store(workspace: Workspace, address: Place) -> Moved:
 
     def settle() -> None:
         _move_files(workspace, target)
-        target.save_study()
-        write_anchor(address, study)
+        target.save_study()  # last: it makes the address a study
         (workspace.root / STUDY).rename(workspace.root / LEFT)
 
     return move_rows(workspace, session_of(DATABASE, study.name), settle)

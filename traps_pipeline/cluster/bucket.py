@@ -69,11 +69,7 @@ class Bucket:
         except (BaseError, FileNotFoundError) as error:
             raise self.error(error) from None
 
-    def delete(self, digest: bytes) -> None:
-        """Remove an object. Raises TrapsError."""
-        self.delete_all([object_name(digest)])
-
-    def delete_all(self, names: Sequence[str]) -> None:
+    def delete(self, names: Sequence[str]) -> None:
         """Remove objects. Raises TrapsError."""
         import obstore
         from obstore.exceptions import BaseError

@@ -12,7 +12,12 @@ import time
 from collections.abc import Iterator
 
 import dagster as dg
-from dagster._core.launcher import WorkerStatus
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.cluster.bucket import Bucket
+from traps_pipeline.cluster.history import logs_folder
+from traps_pipeline.cluster.logs import fetch
+from traps_pipeline.storage.workspace import Workspace
 
 LOST_S = 90  # after so long a run that Ray knows nothing of was never submitted, or Ray's head lost it
 INTERVAL_S = 15
@@ -20,7 +25,7 @@ _BEFORE = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
 
 
 def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list[str]:
-    """Mark runs as failed that will never begin; their ids. Raises OSError while Ray's head does not answer."""
+    """Mark runs as failed that will never begin; return their ids. Raises OSError while Ray's head does not answer."""
     failed = list[str]()
     for run, why in _lost(instance, lost_s):
         now = instance.get_run_by_id(run.run_id)
@@ -38,23 +43,26 @@ def _lost(instance: dg.DagsterInstance, lost_s: float) -> Iterator[tuple[dg.Dags
             if is_old:
                 yield run, "the command that made it ended before it was in the queue"
             continue
-        found = instance.run_launcher.check_run_worker_health(run)
-        if found.status == WorkerStatus.UNKNOWN and is_old:
-            yield run, f"Ray knows nothing of its job ({found.msg})"
-        elif found.status in (WorkerStatus.FAILED, WorkerStatus.SUCCESS):
-            yield run, f"its job on Ray has ended ({found.msg})"
+        health = instance.run_launcher.check_run_worker_health(run)
+        if health.status.name == "UNKNOWN" and is_old:
+            yield run, f"Ray knows nothing of its job ({health.msg})"
+        elif health.status.name in ("FAILED", "SUCCESS"):
+            yield run, f"its job on Ray has ended ({health.msg})"
 
 
 @dg.sensor(
     minimum_interval_seconds=INTERVAL_S,
     default_status=dg.DefaultSensorStatus.RUNNING,
     description="Marks runs as failed that wait for no host any more, since Ray's head lost them or their job ended "
-    "before they began. Those that wait for a host go on waiting.",
+    "before they began; those that wait for a host go on waiting. Fetches what runs print from the study's store.",
 )
-def lost_runs(context: dg.SensorEvaluationContext) -> dg.SkipReason:
+def end_lost_runs(context: dg.SensorEvaluationContext) -> dg.SkipReason:
     """For studies whose runs go to a cluster."""
+    workspace = Workspace.open()
     try:
         failed = fail_lost_runs(context.instance)
-    except OSError as error:
-        return dg.SkipReason(f"Ray's head does not answer: {error}")
+        if isinstance(workspace.place, str):
+            fetch(Bucket(workspace.place), logs_folder(workspace))
+    except (OSError, TrapsError) as error:
+        return dg.SkipReason(f"Ray's head or the store does not answer: {error}")
     return dg.SkipReason(f"{len(failed)} runs were lost: {', '.join(failed)}" if failed else "no run was lost")

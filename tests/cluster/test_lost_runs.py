@@ -21,8 +21,10 @@ from dagster._utils.error import serializable_error_info_from_exc_info
 
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.orchestration.cluster import STUDY_TAG, RayRuns, dagster_yaml
-from traps_pipeline.orchestration.lost_runs import fail_lost_runs
+from traps_pipeline.cluster.history import dagster_yaml
+from traps_pipeline.cluster.lost_runs import fail_lost_runs
+from traps_pipeline.cluster.ray_runs import RayRuns
+from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -44,7 +46,9 @@ def history(folder: Path, ray: str) -> Iterator[dg.DagsterInstance]:
     folder.mkdir()
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv(RAY, ray)
-        said = {"run_launcher": dagster_yaml("X", "s3://lab/study")["run_launcher"], "telemetry": {"enabled": False}}
+        patched.setenv("LAB_DATABASE", "postgresql://user:secret@host/db")
+        settings = dagster_yaml(Workspace(folder, Study(name="lab", database="LAB_DATABASE")))
+        said = {"run_launcher": settings["run_launcher"], "telemetry": {"enabled": False}}
     (folder / "dagster.yaml").write_text(yaml.safe_dump(said))
     with dg.DagsterInstance.from_config(str(folder)) as instance:
         yield instance
@@ -53,7 +57,7 @@ def history(folder: Path, ray: str) -> Iterator[dg.DagsterInstance]:
 def launched(instance: dg.DagsterInstance) -> dg.DagsterRun:
     """A run that has left the queue, as Dagster's daemon tells it before it is submitted."""
     origin = dg.reconstructable(study).get_python_origin()
-    run = instance.create_run_for_job(study, tags={STUDY_TAG: "lab"}, job_code_origin=origin)
+    run = instance.create_run_for_job(study, tags={STUDY_TAG: "lab", RESOURCES_TAG: "{}"}, job_code_origin=origin)
     starting = dg.DagsterEvent(event_type_value=dg.DagsterEventType.PIPELINE_STARTING.value, job_name="study")
     instance.report_dagster_event(starting, run.run_id)
     return run
@@ -69,7 +73,7 @@ def state(instance: dg.DagsterInstance, run: dg.DagsterRun) -> str:
 def told(instance: dg.DagsterInstance, run: dg.DagsterRun) -> str:
     """What the command that waits for it says when it has ended."""
     watching = RayRuns(instance, Workspace(Path("/"), Study(name="lab")), 1, 0.0, "leave")
-    ((problem,),) = (ran.problems for ran in watching._watch([run.run_id]))
+    ((problem,),) = (ran.problems for ran in watching._watch([], [run.run_id]))
     return problem
 
 
@@ -94,10 +98,12 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
 
         remedied(
             launch,
-            "orchestration",
+            "cluster.launcher",
             cluster.start_head,
         )
-        client = launcher.client
+        from ray.job_submission import JobSubmissionClient
+
+        client = JobSubmissionClient(launcher.address)
         client.submit_job(submission_id=f"dagster-run-{ended.run_id}", entrypoint="false")  # takes no CPU
         until = time.monotonic() + CAN_END_S
         while not client.get_job_status(f"dagster-run-{ended.run_id}").is_terminal():

@@ -14,7 +14,6 @@ from typing import Any
 
 import dagster as dg
 import pytest
-import yaml
 from dagster._core.events import StepMaterializationData
 from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
@@ -25,21 +24,18 @@ from traps_pipeline.base.progress import Progress, Tally, reporting
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import CLIPS
+from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml, export
+from traps_pipeline.cluster.node import REFUSED_TAG
+from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
+from traps_pipeline.cluster.requests import REQUEST_TAG, Request, start_requested_runs, submit
+from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
+from traps_pipeline.cluster.same_code import code_here, installed, require_same_code
 from traps_pipeline.defs import benchmark
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.cluster import (
-    RESOURCES_TAG,
-    STUDY_TAG,
-    RayRuns,
-    dagster_yaml,
-    own_tags,
-    require_cluster,
-)
 from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.runs import broke_off, range_tags
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installed, require_same_code
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
-from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.study import Study
@@ -51,14 +47,28 @@ def workspace(tmp_path: Path) -> Workspace:
     return Workspace(tmp_path, Study(name="lab"))
 
 
+@pytest.fixture
+def remote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workspace:
+    """A study whose runs go to a cluster, with the variables that its hosts export."""
+    monkeypatch.setenv(RAY, "http://head:8265")
+    monkeypatch.setenv("LAB_DATABASE", "postgresql://user:secret@host/db")
+    for exported in (HISTORY, LOGS):
+        monkeypatch.setenv(exported, "")  # and as it was after the test
+    monkeypatch.delenv("DAGSTER_HOME", raising=False)
+    return Workspace(tmp_path, Study(name="lab", database="LAB_DATABASE"), "s3://lab/study")
+
+
 def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
-    monkeypatch: pytest.MonkeyPatch,
+    remote: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    works = {"TRAPS_WORKSPACE": "s3://lab/study", "TRAPS_CORES": "4"}
+    works = {
+        "TRAPS_WORKSPACE": "s3://lab/study", "TRAPS_RAY": "http://head:8265", "TRAPS_CODE": code_here(),
+        "TRAPS_CORES": "4",
+    }  # fmt: skip
 
     def taken(stage: str, keys: Sequence[str] = (), gpus: float = 0.0) -> dict[str, Any]:
-        tags = own_tags("lab", "s3://lab/study", [the_graph()[stage]], keys, 4, gpus)
-        assert tags[STUDY_TAG] == "lab" and tags[CODE_TAG] == code_here()
+        tags = own_tags(remote, [the_graph()[stage]], keys, 4, gpus)
+        assert tags[STUDY_TAG] == "lab"
         return json.loads(tags[RESOURCES_TAG])
 
     one = {"num_cpus": 1, "runtime_env": {"env_vars": works | {"TRAPS_CORES": "1"}}}
@@ -104,21 +114,21 @@ def test_rendering_is_as_many_runs_as_the_missing_clips_are_worth(workspace: Wor
 def test_a_person_is_told_once_that_no_host_takes_any_run(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("traps_pipeline.orchestration.cluster.IDLE_S", 0.0)
+    monkeypatch.setattr("traps_pipeline.cluster.ray_runs.IDLE_S", 0.0)
     shown = Shown()
     with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
         run = instance.create_run_for_job(_nothing, tags={"dagster-ray/config": '{"num_cpus": 16}'})
         starting = dg.DagsterEvent(event_type_value=dg.DagsterEventType.PIPELINE_STARTING.value, job_name="_nothing")
         instance.report_dagster_event(starting, run.run_id)
-        watching, left = RayRuns(instance, workspace, 1, 0.0, "leave"), [run.run_id]
+        watching, run_ids = RayRuns(instance, workspace, 1, 0.0, "leave"), [run.run_id]
         for _ in range(3):
-            watching._look_at(left, [])
+            watching._look_at([], run_ids, [])
             time.sleep(0.01)
         assert [note for note in shown.notes if "for a host that is free and has num_cpus 16" in note] == shown.notes
         assert len(shown.notes) == 1
         instance.report_run_failed(run, "it was ended")
-        watching._look_at(left, [])
-        assert not left
+        watching._look_at([], run_ids, [])
+        assert not run_ids
 
 
 class Shown(Progress):
@@ -159,13 +169,13 @@ def test_what_runs_did_for_one_partition_is_told_once_and_added_up(workspace: Wo
             of_both.append(run.run_id)
         watching = RayRuns(instance, workspace, 1, 0.0, "leave")
         for run_id in of_both:
-            watching._tell(run_id)
+            watching._report(run_id)
     assert shown.partitions == [("videos", "plinko")] and shown.totals["videos"].frames == 100
 
 
-def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspace) -> None:
-    require_same_code({CODE_TAG: code_here()}, "lab")
-    require_same_code({}, "lab")  # a run of this host's own
+def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
+    require_same_code(code_here(), "lab")
+    require_same_code("", "lab")  # a run of this host's own
     theirs = json.loads(code_here())
     theirs["files"]["assets"], theirs["versions"]["numpy"], theirs["versions"]["numba"] = "0123", "1.0", "9"
     del theirs["versions"]["mujoco"]  # which it does not have: what only one of them has is not compared
@@ -173,21 +183,18 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspac
         TrapsError, match=rf"^the host .* has other code .* of the study lab: files of assets \w+ here and 0123 there, "
         rf"numpy {installed()['numpy']} here and 1\.0 there\. Install",
     ):  # fmt: skip
-        require_same_code({CODE_TAG: json.dumps(theirs)}, "lab")
-    with pytest.raises(TrapsError, match=r"traps-pipeline 0\.2\.0 here and 0\.1\.9, files x there"):
-        require_same_code({CODE_TAG: "0.1.9, files x"}, "lab")  # of a version that said it in other words
+        require_same_code(json.dumps(theirs), "lab")
 
 
 @pytest.mark.slow
 def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
-    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+    workspace: Workspace, remote: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("ray", "dagster_ray", "dagster_postgres"):
         pytest.importorskip(name, reason="the extra `cluster` is not installed")
     instance = dg.DagsterInstance.ephemeral()
-    with pytest.raises(TrapsError, match=r"^the host .* of the study lab: other hosts do not see .*s3://BUCKET/STUDY"):
+    with pytest.raises(TrapsError, match=r"^the host .* of the study lab: its ledger lies in .*s3://BUCKET/STUDY"):
         require_cluster(workspace, instance)
-    remote = Workspace(workspace.root, workspace.study, "s3://lab/study")
     monkeypatch.delenv(RAY, raising=False)
     with pytest.raises(TrapsError, match=r"^the host .* of the study lab: TRAPS_RAY is not set"):
         require_cluster(remote, instance)
@@ -198,92 +205,99 @@ def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
         require_cluster(remote, instance)
 
 
-def test_what_dagster_is_told_holds_no_address_of_the_database(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(RAY, "http://head:8265")
-    monkeypatch.setenv("TRAPS_DATABASE", "postgresql://user:secret@host/db")
-    said = dagster_yaml("TRAPS_DATABASE", "s3://lab/study")
-    assert "secret" not in str(said) and said["concurrency"]["runs"]["max_concurrent_runs"] == 40
-    assert said["run_launcher"]["config"]["ray"] == {
-        "address": "http://head:8265", "num_cpus": 1, "runtime_env": {
-            "env_vars": {"TRAPS_WORKSPACE": "s3://lab/study", "TRAPS_CORES": "1"}
-        },
-    }  # fmt: skip
+def test_dagsters_settings_hold_no_address_of_the_database(remote: Workspace) -> None:
+    settings = dagster_yaml(remote)
+    assert "secret" not in str(settings) and settings["concurrency"]["runs"]["max_concurrent_runs"] == 40
+    assert settings["run_launcher"]["config"]["ray"] == {"address": "http://head:8265", "num_cpus": 1}
+    assert settings["storage"] == {"postgres": {"postgres_url": {"env": "TRAPS_HISTORY"}}}
+    assert os.environ["TRAPS_HISTORY"] == "postgresql+psycopg2://user:secret@host/db"
 
 
 @pytest.mark.slow
-def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
-    launcher = pytest.importorskip(
-        "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
-    )
-    sent = list[str]()
-    base = launcher.QuotingRayRunLauncher.__mro__[1]
-    monkeypatch.setattr(base, "_launch_ray_job", lambda self, id_, entrypoint, run: sent.append(entrypoint))
-    told = """{"config_yaml": "'variable: X'", "a": 1}"""
-    run = dg.DagsterRun("a job", tags={CODE_TAG: code_here()})
-    launcher.QuotingRayRunLauncher("http://head:8265")._launch_ray_job("1", f"dagster api execute_run '{told}'", run)
-    assert shlex.split(sent[0]) == ["dagster", "api", "execute_run", told]
+def test_the_command_line_of_a_run_survives_a_shell() -> None:
+    launcher = pytest.importorskip("traps_pipeline.cluster.launcher", reason="the extra `cluster` is not installed")
+    run = """{"config_yaml": "'variable: X'", "a": 1}"""
+    command = launcher.node_command(f"/venv/bin/dagster api execute_run '{run}'", "r1")
+    node = ["python", "-P", "-m", "traps_pipeline.cluster.node", "r1"]
+    assert shlex.split(command) == [*node, "api", "execute_run", run]
 
 
 @pytest.mark.slow
 def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command_line_does(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    launcher = pytest.importorskip(
-        "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
-    )
+    launcher = pytest.importorskip("traps_pipeline.cluster.launcher", reason="the extra `cluster` is not installed")
     monkeypatch.setenv("TRAPS_WORKSPACE", str(Workspace.create(tmp_path / "study", Study(name="lab")).root))
     monkeypatch.setenv("TRAPS_RUN_CPUS", "4")
     monkeypatch.setenv("TRAPS_RUN_GPUS", "1")
-    sent = list[dict[str, str]]()
-    base = launcher.QuotingRayRunLauncher.__mro__[1]
-    monkeypatch.setattr(base, "_launch_ray_job", lambda self, id_, entrypoint, run: sent.append(run.tags))
-    with dg.DagsterInstance.ephemeral() as instance:
-        starts = launcher.QuotingRayRunLauncher("http://head:8265")
-        starts.register_instance(instance)
-        for stage, key in ((benchmark.VIDEOS.name, "dominoes"), (RESPONSES.name, "chaotic|pocket__standard__run1")):
-            selected = {asset_key(stage)}
-            tags = {"dagster/partition": key}
-            run = dg.DagsterRun("__ASSET_JOB", asset_selection=frozenset(selected), tags=tags)
-            instance.add_run(run)
-            starts._launch_ray_job("1", "dagster api execute_run '{}'", run)
-            kept = instance.get_run_by_id(run.run_id)
-            assert kept is not None and kept.tags.items() >= sent[-1].items()
-    assert [tags[CODE_TAG] for tags in sent] == [code_here()] * 2 and {tags[STUDY_TAG] for tags in sent} == {"lab"}
-    rendering, asking = (json.loads(tags[RESOURCES_TAG]) for tags in sent)
+
+    def takes(stage: str, key: str) -> dict[str, Any]:
+        selected = frozenset({asset_key(stage)})
+        run = dg.DagsterRun("a job", asset_selection=selected, tags={"dagster/partition": key})
+        tags = launcher.tags_of_page_run(run)
+        assert tags[STUDY_TAG] == "lab"
+        return json.loads(tags[RESOURCES_TAG])
+
+    rendering, asking = (
+        takes(benchmark.VIDEOS.name, "dominoes"),
+        takes(RESPONSES.name, "chaotic|pocket__standard__run1"),
+    )
     assert (rendering["num_cpus"], rendering.get("num_gpus")) == (4, None) and rendering["memory"]
     assert (asking["num_cpus"], asking["num_gpus"]) == (1, 1.0)
+    of_one_op = json.loads(launcher.tags_of_page_run(dg.DagsterRun("everything"))[RESOURCES_TAG])
+    assert of_one_op["num_cpus"] == 1 and of_one_op["runtime_env"]["env_vars"]["TRAPS_CODE"] == code_here()
+
+
+def test_a_run_that_is_asked_for_is_created_once_for_its_own_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(Workspace.create(tmp_path / "study", Study(name="lab")).root))
+    stages = [SCENE_SPECS.name, VIDEOS.name]
+    with dg.DagsterInstance.ephemeral() as instance:
+        submit(instance, "another", Request(stages, {}))
+        name = submit(instance, "lab", Request(stages, {"traps/make": "stale", **range_tags(("dominoes", "plinko"))}))
+        with dg.build_sensor_context(instance) as context:
+            first = start_requested_runs(context)
+        assert isinstance(first, dg.SensorResult)
+        with dg.build_sensor_context(instance, cursor=first.cursor) as context:
+            second = start_requested_runs(context)
+    assert isinstance(second, dg.SensorResult)
+    (request,) = first.run_requests or ()
+    assert request.run_key == request.tags[REQUEST_TAG] == name
+    assert request.asset_selection == [asset_key(stage) for stage in stages]
+    assert request.tags["dagster/asset_partition_range_end"] == "plinko" and request.tags["traps/make"] == "stale"
+    assert second.run_requests == []
 
 
 @pytest.mark.slow
-def test_a_worker_with_a_wrong_password_names_itself_the_study_and_the_variable(
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_host_with_a_wrong_password_names_its_remedy_and_not_the_password(
+    remote: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
     with Postgres.running() as server:
-        monkeypatch.setenv("TRAPS_WORKSPACE", "s3://lab/study")
-        monkeypatch.setenv("TRAPS_DATABASE", f"postgresql://traps:a-wrong-word@127.0.0.1:{server.port}/traps")
-        with pytest.raises(
-            TrapsError,
-            match=r"^the host .* cannot open the history of the study s3://lab/study with TRAPS_DATABASE \(.*\)",
-        ) as raised:
-            SharedHistory.from_config_value(None, {"variable": "TRAPS_DATABASE"})
-        assert "a-wrong-word" not in str(raised.value) and raised.value.__cause__ is None
+        monkeypatch.setenv("LAB_DATABASE", f"postgresql://traps:a-wrong-word@127.0.0.1:{server.port}/postgres")
+        with (
+            pytest.raises(
+                TrapsError, match=r"history cannot be read .*password authentication.*address, user"
+            ) as raised,
+            dagster_history(remote),
+        ):
+            pass
+    assert "a-wrong-word" not in str(raised.value)
 
 
 @pytest.mark.slow
 def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_started(
-    workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    remote: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
     with Postgres.running() as server:
-        monkeypatch.setenv("TRAPS_TEST_HISTORY", server.address())
-        storage = dagster_yaml_of_history("TRAPS_TEST_HISTORY")
-        (tmp_path / "dagster.yaml").write_text(yaml.safe_dump(storage))
-        with dg.DagsterInstance.from_config(str(tmp_path)) as instance:
+        monkeypatch.setenv("LAB_DATABASE", server.address())
+        with dagster_history(remote) as instance:
             run = instance.create_run_for_job(_nothing)
-            watching = RayRuns(instance, workspace, 1, 0.0, "leave")
+            watching = RayRuns(instance, remote, 1, 0.0, "leave")
             ended = list[Any]()
-            thread = threading.Thread(target=lambda: ended.extend(watching._watch([run.run_id])))
+            thread = threading.Thread(target=lambda: ended.extend(watching._watch([], [run.run_id])))
             thread.start()
             server.stop()
             time.sleep(3)
@@ -303,18 +317,30 @@ def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
     with dg.DagsterInstance.ephemeral() as instance:
         watching, submitted = RayRuns(instance, workspace, 1, 0.0, "leave"), list[str]()
 
-        def submit(*_: object) -> str:
-            run = instance.create_run_for_job(_nothing)
-            submitted.append(run.run_id)
+        def create(*_: object) -> str:  # what Dagster's daemon and a node do
+            name = f"request-{len(submitted)}"
+            submitted.append(name)
             if len(submitted) <= times:
+                run = instance.create_run_for_job(_nothing, tags={REQUEST_TAG: name})
                 instance.report_run_failed(run, "its host is gone")
-                return run.run_id
-            return _nothing.execute_in_process(instance=instance).run_id
+            else:
+                _nothing.execute_in_process(instance=instance, tags={REQUEST_TAG: name})
+            return name
 
-        monkeypatch.setattr(watching, "_submit", submit)
+        monkeypatch.setattr(watching, "_submit", create)
         told = [problem for ran in watching.make([], [(None, None)], {}) for problem in ran.problems]
     assert len(submitted) == 2
     assert (told == []) == (times == 1) and all("ended as failure (its host is gone)" in one for one in told)
+
+
+def test_a_run_that_its_node_refuses_is_not_tried_again_and_its_sentence_is_reported(workspace: Workspace) -> None:
+    with dg.DagsterInstance.ephemeral() as instance:
+        watching = RayRuns(instance, workspace, 1, 0.0, "leave")
+        watching._requests = {"r": Request([], {})}
+        run = instance.create_run_for_job(_nothing, tags={REQUEST_TAG: "r", REFUSED_TAG: "true"})
+        instance.report_run_failed(run, "the host two has other code than ..")
+        (ran,) = watching._watch(["r"], [])
+    assert ran.problems == ["the host two has other code than .."] and watching._requests
 
 
 @pytest.mark.parametrize("error", [TrapsError("the budget is reached"), ConnectionError("the server is gone")])
@@ -354,8 +380,8 @@ def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path:
 
 
 @pytest.mark.slow
-def test_a_shared_history_keeps_its_connection_and_survives_a_restart_of_the_server(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_keeps_its_connections_and_survives_a_restart_of_the_server(
+    remote: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
     import psycopg
@@ -365,24 +391,19 @@ def test_a_shared_history_keeps_its_connection_and_survives_a_restart_of_the_ser
             connection.execute("alter system set log_connections to on")
             connection.execute("select pg_reload_conf()")
         monkeypatch.setenv("LAB_DATABASE", server.address())
-        (tmp_path / "dagster.yaml").write_text(yaml.safe_dump(dagster_yaml_of_history("LAB_DATABASE")))
-        with dg.DagsterInstance.from_config(str(tmp_path)) as instance:
-            said = server.folder / "log"
-            opened = said.read_text().count("connection authorized")
+        with dagster_history(remote):
+            pass
+        export(remote, is_kept=True)
+        with dg.DagsterInstance.from_config(str(remote.dagster_home)) as instance:
+            log = server.folder / "log"
+            opened = log.read_text().count("connection authorized")
             for number in range(20):
                 instance.report_runless_asset_event(dg.AssetMaterialization("clips", partition=f"{number}"))
-            assert said.read_text().count("connection authorized") - opened < 5  # by itself it makes two for each
+            assert log.read_text().count("connection authorized") - opened < 5  # by itself it makes two for each
             server.stop()
             server.start()
             instance.report_runless_asset_event(dg.AssetMaterialization("clips", partition="20"))
             assert len(instance.get_materialized_partitions(dg.AssetKey("clips"))) == 21
-
-
-def dagster_yaml_of_history(variable: str) -> dict[str, Any]:
-    """Of what a study's Dagster is told, where its history lies."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(RAY, "http://127.0.0.1:1")
-        return {"storage": dagster_yaml(variable, "s3://lab/study")["storage"], "telemetry": {"enabled": False}}
 
 
 @dg.op
@@ -414,14 +435,14 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
 
         monkeypatch.setattr(asking, "_look_at", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            asking._watch([run.run_id])
+            asking._watch([], [run.run_id])
         assert ended == ([run.run_id] if on_interrupt == "cancel" else [])
         instance.report_run_failed(run, "it was ended")
         instance.add_run(dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "another"}))
         again = dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "lab"})
         instance.add_run(again)
         next_one = RayRuns(instance, workspace, 1, 0.0, on_interrupt)
-        monkeypatch.setattr(next_one, "_watch", lambda run_ids: watched.extend(run_ids))
+        monkeypatch.setattr(next_one, "_watch", lambda _, run_ids: watched.extend(run_ids))
         watched = list[str]()
         with next_one:
             assert watched == [again.run_id]

@@ -1,0 +1,46 @@
+"""What the other rooms ask of this one: see `storage/several_hosts.py`, by which they find it.
+
+What stands above the storage is imported in functions: it opens the study while it is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.cluster.places import open_store
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import dagster as dg
+
+    from traps_pipeline.orchestration.runs import Runs
+
+__all__ = ["dagster_yaml", "open_store", "runs", "sensors"]
+
+
+def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
+    """See `SeveralHosts`."""
+    from traps_pipeline.cluster import history
+
+    return history.dagster_yaml(workspace)
+
+
+@contextmanager
+def runs(workspace: Workspace, instance: dg.DagsterInstance, options: argparse.Namespace) -> Iterator[Runs]:
+    """See `SeveralHosts`."""
+    from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
+
+    require_cluster(workspace, instance)
+    with RayRuns(instance, workspace, options.runs, options.gpus, options.on_interrupt, options.cpus) as runs:
+        yield runs
+
+
+def sensors() -> Sequence[dg.SensorDefinition]:
+    """See `SeveralHosts`."""
+    from traps_pipeline.cluster.lost_runs import end_lost_runs
+    from traps_pipeline.cluster.requests import start_requested_runs
+
+    return [start_requested_runs, end_lost_runs]

@@ -1,0 +1,90 @@
+"""The launcher of runs on Ray, which `dagster.yaml` names: dagster-ray's own, through `cluster/node.py`."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+import dagster as dg
+from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] - of the extra `cluster`
+from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMissingImports]
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.orchestration.graph import Stage, the_graph
+from traps_pipeline.orchestration.runs import range_of
+from traps_pipeline.storage.workspace import RAY, RUN_CPUS, RUN_GPUS, Workspace
+
+
+class ClusterLauncher(RayRunLauncher):
+    """Launches every run through `cluster/node.py`, with the resources that its stages declare."""
+
+    @cached_property
+    def client(self) -> JobSubmissionClient:
+        """Ray's client, through which dagster-ray submits jobs."""
+        return _NodeClient(self.address, metadata=self.metadata, headers=self.headers, cookies=self.cookies)
+
+    def launch_run(self, context: Any) -> None:
+        """Launch a run. One that Dagster's pages or sensors created gets the tags of one that a command asks for."""
+        run = context.dagster_run
+        if RESOURCES_TAG not in run.tags:
+            tags = tags_of_page_run(run)
+            context.workspace.instance.add_run_tags(run.run_id, tags)
+            run = run.with_tags({**run.tags, **tags})
+            context = type(context)(run, context.workspace)
+        with self._answering(run):
+            super().launch_run(context)
+
+    def resume_run(self, context: Any) -> None:
+        """Launch a run once more whose host died."""
+        with self._answering(context.dagster_run):
+            super().resume_run(context)
+
+    @contextmanager
+    def _answering(self, run: dg.DagsterRun) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise TrapsError(
+                f"{self.address}: Ray's head does not answer the host {socket.gethostname()}, which starts the runs of "
+                f"the study {run.tags.get(STUDY_TAG, '')} ({' '.join(str(error).split())[:200]}). See that the head "
+                f"runs (`ray status`) and that {RAY} is its address; then run the same command again"
+            ) from error
+
+
+class _NodeClient(JobSubmissionClient):
+    """Submits a run's command through `cluster/node.py`, quoted for a shell.
+
+    dagster-ray 0.4.8 puts the run, as JSON, between single quotes without looking whether it holds some.
+    """
+
+    def submit_job(self, *, entrypoint: str, metadata: dict[str, str], **options: Any) -> str:
+        """Submit a job; return its id."""
+        return super().submit_job(
+            entrypoint=node_command(entrypoint, metadata["dagster/run-id"]), metadata=metadata, **options
+        )
+
+
+def node_command(entrypoint: str, run_id: str) -> str:
+    """Return the command line of a run's job, for dagster-ray's `dagster api .. '{..}'`."""
+    command, _, run = entrypoint.partition(" '")
+    _, *arguments = command.split()  # without the `dagster` of the host that launches it
+    return shlex.join(["python", "-P", "-m", "traps_pipeline.cluster.node", run_id, *arguments, run.removesuffix("'")])
+
+
+def tags_of_page_run(run: dg.DagsterRun) -> dict[str, str]:
+    """Return the tags that `traps run --cluster` would have given a run of Dagster's pages, or of its sensors."""
+    import traps_pipeline.definitions  # noqa: F401 - declares the stages, which the daemon's process has not loaded
+
+    workspace, declared = Workspace.open(), the_graph().declared
+    names = [key.path[-1] for key in run.asset_selection or ()]
+    stages = [one for name in names if isinstance(one := declared.get(name), Stage)]
+    keys = keys_in([one for one in stages if one.name == RESPONSES.name], range_of(run.tags))
+    cpus, gpus = int(os.environ.get(RUN_CPUS, "1")), float(os.environ.get(RUN_GPUS, "0"))
+    return own_tags(workspace, stages, keys, cpus, gpus)

@@ -1,0 +1,69 @@
+"""What runs print, where a study lies in an object store: Dagster's pages on the head show it.
+
+A node captures it in a folder of its own and brings it to the store every UPLOAD_S and when the run ends, so that of a
+host that died all but the last moments is there. The head fetches it. These are the only objects with names of their
+own that change; nothing is decided from them.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes
+from traps_pipeline.cluster.bucket import Bucket
+from traps_pipeline.cluster.history import logs_folder
+from traps_pipeline.storage.workspace import Workspace
+
+UPLOAD_S = 30.0
+PREFIX = "logs"  # in the store
+
+
+@contextmanager
+def uploading(workspace: Workspace, run_id: str) -> Iterator[None]:
+    """Bring what a run prints to the study's store, within the block and at its end."""
+    if not isinstance(workspace.place, str):
+        yield  # all hosts see the folder
+        return
+    bucket, folder, sizes = Bucket(workspace.place), logs_folder(workspace), dict[Path, int]()
+    is_over = threading.Event()
+
+    def work() -> None:
+        while not is_over.wait(UPLOAD_S):
+            upload(bucket, folder, run_id, sizes)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+        upload(bucket, folder, run_id, sizes)
+
+
+def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) -> None:
+    """Bring files of a run's logs to the store that have grown. sizes: of what was brought, by file. A store that does
+    not answer does not end the run."""
+    try:
+        for path in (folder / run_id).rglob("*.*"):
+            content = path.read_bytes()
+            if sizes.get(path) != len(content):
+                bucket.put(f"{PREFIX}/{path.relative_to(folder).as_posix()}", content)
+                sizes[path] = len(content)
+    except TrapsError as error:
+        print(f"what this run prints was not brought to the store: {error}", file=sys.stderr)
+
+
+def fetch(bucket: Bucket, folder: Path) -> None:
+    """Bring all logs from the store into a folder that it has not, or not whole. Raises TrapsError."""
+    for name, size, _ in bucket.names(PREFIX):
+        path = folder / Path(name).relative_to(PREFIX)
+        if path.resolve().is_relative_to(folder.resolve()) and (not path.exists() or path.stat().st_size != size):
+            content = bucket.get(name)
+            if content is not None:
+                write_bytes(path, content)

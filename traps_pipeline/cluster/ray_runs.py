@@ -1,0 +1,280 @@
+"""Runs on other hosts: `traps run EXPERIMENT --cluster` asks for them, and Dagster's daemon starts them on Ray.
+
+The head of the cluster runs Dagster's daemon (`traps ui`), which creates the runs that a command asks for, starts them
+as Ray jobs and resumes those whose host died. This module cuts what is missing into ranges, asks for their runs, and
+reports what they do.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Literal
+
+import dagster as dg
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.databases import database_error
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import missing
+from traps_pipeline.cluster.node import REFUSED_TAG
+from traps_pipeline.cluster.requests import REQUEST_TAG, Request, submit
+from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
+from traps_pipeline.orchestration.graph import Stage, the_graph
+from traps_pipeline.orchestration.ranges import Range, cut, shared_out
+from traps_pipeline.orchestration.runs import Ran, Runs, broke_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.orchestration.step import TAKEN, TALLY
+from traps_pipeline.storage.database import PATIENCE_S
+from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
+
+POLL_S = 1.0
+IDLE_S = 60.0  # after so long a person reads that runs wait for a host, or for the daemon
+ALIVE_S = 120  # a daemon that has been silent for longer is dead
+CREATED_S = 30.0  # a command that ends its runs waits so long for the daemon to create those that it asked for
+DAEMONS = ("QUEUED_RUN_COORDINATOR", "SENSOR")
+ENDS = 300  # letters of the beginning and of the end of a lost run's last message
+OnInterrupt = Literal["leave", "cancel"]
+_UNFINISHED = (
+    dg.DagsterRunStatus.QUEUED,
+    dg.DagsterRunStatus.NOT_STARTED,
+    dg.DagsterRunStatus.STARTING,
+    dg.DagsterRunStatus.STARTED,
+    dg.DagsterRunStatus.CANCELING,
+)
+_WRITTEN, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.STEP_FAILURE
+_ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.DagsterEventType.ENGINE_EVENT}
+
+
+def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
+    """Check that runs can be asked for from here: other hosts see the study, Ray's address is known, and a daemon takes
+    runs from the queue. Raises TrapsError."""
+    where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
+    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+        raise TrapsError(
+            f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
+            "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
+        )
+    if not workspace.study.database:
+        raise TrapsError(
+            f"{where}its ledger lies in {workspace.root}, where one host writes; a study for --cluster keeps it in "
+            f"PostgreSQL, and its files in a folder that all hosts see or in an object store: {VARIABLE}="
+            "s3://BUCKET/STUDY (docs/cluster.md)"
+        )
+    if not os.environ.get(RAY):
+        raise TrapsError(
+            f"{where}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
+        )
+    beats = instance.get_daemon_heartbeats()
+    oldest = min(beats[name].timestamp if name in beats else 0.0 for name in DAEMONS)
+    if time.time() - oldest > ALIVE_S:
+        raise TrapsError(
+            f"{where}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
+            "the same command again"
+        )
+
+
+class RayRuns(Runs):
+    """Runs of a study in Dagster's queue. most: into which a group of stages is cut. gpus: of each run that loads a
+    local model. cpus: of each run that works on as many as it is given."""
+
+    def __init__(
+        self,
+        instance: dg.DagsterInstance,
+        workspace: Workspace,
+        most: int,
+        gpus: float,
+        on_interrupt: OnInterrupt,
+        cpus: int = 1,
+    ) -> None:
+        self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
+        self._most, self._gpus, self._cpus = most, gpus, cpus
+        self._idle_since, self._is_reported_idle = float("inf"), False  # while all runs wait for a host
+        self._keys = frozenset[str | None]()
+        self._requests: dict[str, Request] = {}  # by name: those that are asked for once more if they break off
+        self._cursors: dict[str, str | None] = {}
+        self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
+
+    def __enter__(self) -> RayRuns:
+        """Wait for runs that an earlier command left."""
+        ours = dg.RunsFilter(statuses=[*_UNFINISHED], tags={STUDY_TAG: self._workspace.study.name})
+        if runs := [*self._instance.get_runs(ours)]:
+            progress.current().note(f"{len(runs)} runs of this study go on that were left; waiting for them first")
+            progress.current().stage("runs that were left", sum(map(_partitions, runs)))
+            self._watch([], [run.run_id for run in runs])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is held."""
+
+    def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
+        """Return ranges for several hosts: so many that all have work, and so few that starting them costs little. What
+        one model is asked stays together, so that it is loaded in few runs. Runs that share what they make may have the
+        same range."""
+        self._keys = frozenset(keys)
+        scheme = stages[0].scheme if stages else None
+        shared = [stage.shared for stage in stages if stage.shared is not None]
+        if not shared:
+            return cut(scheme, keys, self._most)
+        seconds = {key: sum(one.seconds(self._workspace, key) for one in shared) / self._cpus for key in keys}
+        return shared_out(scheme, keys, seconds, self._most)
+
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+        """See `Runs`."""
+        if ranges:
+            progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
+            requests = [self._request(stages, one, tags) for one in ranges]
+            self._requests = {self._submit(request): request for request in requests}
+            yield from self._watch([*self._requests], [])
+
+    def _request(self, stages: Sequence[Stage], of: Range, tags: Mapping[str, str]) -> Request:
+        keys = [key for key in keys_in(stages, of) if key in self._keys]
+        own = own_tags(self._workspace, stages, keys, self._cpus, self._gpus)
+        return Request([stage.name for stage in stages], {**tags, **own, **range_tags(of, always=True)})
+
+    def _submit(self, request: Request) -> str:
+        return submit(self._instance, self._workspace.study.name, request)
+
+    def _watch(self, requests: list[str], run_ids: list[str]) -> list[Ran]:
+        """Report what runs do until all have ended: those that were asked for by these names, and those of these ids.
+        While the database is away, for as long as runs themselves wait for it, they are not given up."""
+        done, seen_at = list[Ran](), time.monotonic()
+        try:
+            while requests or run_ids:
+                try:
+                    self._look_at(requests, run_ids, done)
+                    seen_at = time.monotonic()
+                except Exception as error:
+                    if database_error(error) is None or time.monotonic() - seen_at > PATIENCE_S:
+                        raise
+                if requests or run_ids:
+                    time.sleep(POLL_S)
+        except KeyboardInterrupt:
+            self._interrupted(requests, run_ids)
+            raise
+        return done
+
+    def _look_at(self, requests: list[str], run_ids: list[str], done: list[Ran]) -> None:
+        """Report what these runs have done since the last time. Requests that have runs become these; what came of runs
+        that have ended is added to `done`."""
+        self._take_created(requests, run_ids)
+        runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=run_ids))} if run_ids else {}
+        self._report_waiting(requests, [*runs.values()])
+        for run_id in [*run_ids]:
+            run = runs.get(run_id)
+            self._report(run_id)
+            if run is not None and not run.is_finished:
+                continue
+            run_ids.remove(run_id)
+            name = "" if run is None else run.tags.get(REQUEST_TAG, "")
+            if run is not None and name in self._requests and self._broke_off(run):
+                requests.append(self._submit(self._requests.pop(name)))
+                progress.current().note(f"run {run_id[:8]} broke off, and is made once more")
+            else:
+                done.append(self._ended(run_id, run, self._failures.get(run_id, [])))
+
+    def _broke_off(self, run: dg.DagsterRun) -> bool:
+        return REFUSED_TAG not in run.tags and broke_off(run, self._failures.get(run.run_id, []))
+
+    def _take_created(self, requests: list[str], run_ids: list[str]) -> None:
+        """Let runs that were created take the place of their requests."""
+        if requests:
+            for run in self._instance.get_runs(dg.RunsFilter(tags={REQUEST_TAG: requests})):
+                requests.remove(run.tags[REQUEST_TAG])
+                run_ids.append(run.run_id)
+
+    def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
+        """Say once that nothing has begun for a while: no host has what a run takes, or the daemon creates none."""
+        waiting = [run for run in runs if run.status == dg.DagsterRunStatus.STARTING]
+        if not (waiting or requests) or any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
+            self._idle_since = float("inf")
+            return
+        self._idle_since = min(self._idle_since, time.monotonic())
+        if time.monotonic() - self._idle_since <= IDLE_S or self._is_reported_idle:
+            return
+        self._is_reported_idle = True
+        if waiting:
+            takes = json.loads(waiting[0].tags.get(RESOURCES_TAG, "{}"))
+            resources = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
+            message = (
+                f"{len(waiting)} runs have waited {IDLE_S:.0f} s for a host that is free and has {resources or 'a CPU'}"
+                "; `ray status` on the head shows what there is"
+            )
+        else:
+            message = (
+                f"{len(requests)} runs have waited {IDLE_S:.0f} s for Dagster's daemon to create them; the ticks of "
+                "the sensor start_requested_runs in `traps ui` show why"
+            )
+        progress.current().note(message)
+
+    def _report(self, run_id: str) -> None:
+        """Report partitions that a run has made since the last time, and remember steps that failed."""
+        has_more = True
+        while has_more:
+            cursor, kinds = self._cursors.get(run_id), {_WRITTEN, _FAILED}
+            page = self._instance.get_records_for_run(run_id, cursor, kinds, limit=1000)
+            self._cursors[run_id], has_more = page.cursor, page.has_more
+            for record in page.records:
+                event = record.event_log_entry.get_dagster_event()
+                if event.is_step_failure:
+                    self._failures.setdefault(run_id, []).append(event)
+                    continue
+                written = event.step_materialization_data.materialization
+                if TALLY in written.metadata:
+                    tally = progress.Tally(**json.loads(str(written.metadata[TALLY].value)))
+                    if TAKEN in written.metadata:
+                        progress.current().helped(written.asset_key.path[-1], tally)
+                    else:
+                        progress.current().partition(written.asset_key.path[-1], written.partition or "", tally)
+
+    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> Ran:
+        name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
+        if run is None:
+            return Ran([f"{name} is in Dagster's history no more"], over_budget=False)
+        ran = problems_of(failures)
+        if run.status == dg.DagsterRunStatus.SUCCESS:
+            return Ran([], over_budget=False)
+        if not ran.problems:
+            message = " ".join(self._last_message(run_id).split())
+            # The beginning names what failed, and at its end a log has the cause.
+            why = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
+            if REFUSED_TAG in run.tags:
+                ran.problems.append(message)
+            else:
+                ran.problems.append(f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`")
+        return ran
+
+    def _last_message(self, run_id: str) -> str:
+        """Return why a run ended whose steps do not say it: an error of its launcher, or its last event's message."""
+        logged = [entry.dagster_event for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
+        events = [event for event in logged if event is not None]
+        for event in events[-2:]:  # that a run could not be started stands right before its end
+            if event.is_engine_event and event.engine_event_data.error:
+                return reason(event.engine_event_data.error)
+        messages = [event.message for event in events if not event.is_engine_event and event.message]
+        return messages[-1] if messages else "no reason is known"
+
+    def _interrupted(self, requests: list[str], run_ids: list[str]) -> None:
+        count = len(requests) + len(run_ids)
+        if self._on_interrupt == "leave":
+            progress.current().note(
+                f"{count} runs go on without this command; the same command shows them again, and "
+                "`--on-interrupt cancel` would have ended them"
+            )
+            return
+        until = time.monotonic() + CREATED_S
+        while requests and time.monotonic() < until:
+            self._take_created(requests, run_ids)
+            time.sleep(POLL_S)
+        for run_id in run_ids:
+            self._instance.run_coordinator.cancel_run(run_id)
+        progress.current().note(f"{len(run_ids)} runs were told to end; what they asked and made is kept")
+
+
+def _partitions(run: dg.DagsterRun) -> int:
+    """Return how many partitions a run is to make, those of all its stages."""
+    graph = the_graph()
+    selected = [graph[key.path[-1]] for key in run.asset_selection or ()]
+    return sum(len(keys_in([stage], range_of(run.tags))) or 1 for stage in selected)

@@ -1,0 +1,73 @@
+"""Runs that a command asks for, on whatever host, and that Dagster's daemon on the head creates.
+
+A request is an observation in the shared history, so it outlives the command, the daemon and the head. A sensor turns
+each into a run in Dagster's queue, once: its `run_key` is the request's name.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import dagster as dg
+
+from traps_pipeline.orchestration.translation import asset_key
+from traps_pipeline.storage.workspace import Workspace
+
+REQUEST_TAG = "traps/request"
+INTERVAL_S = 1  # Dagster's daemon looks at sensors every 5 s
+AT_ONCE = 100  # requests that one tick turns into runs
+_BODY = "run"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A run that is asked for: names of its stages, and its tags."""
+
+    stages: Sequence[str]
+    tags: Mapping[str, str]
+
+
+def submit(instance: dg.DagsterInstance, study: str, request: Request) -> str:
+    """Ask for a run of a study; return the request's name, which the run carries as its `REQUEST_TAG`."""
+    name = secrets.token_hex(8)
+    body = {"name": name, "stages": [*request.stages], "tags": dict(request.tags)}
+    instance.report_runless_asset_event(dg.AssetObservation(_key(study), metadata={_BODY: json.dumps(body)}))
+    return name
+
+
+def _key(study: str) -> dg.AssetKey:
+    return dg.AssetKey([study, "requested_runs"])
+
+
+@cache
+def _study_here() -> str:
+    return Workspace.open().study.name
+
+
+def _requests(result: dg.EventRecordsResult) -> Iterator[dg.RunRequest]:
+    for record in result.records:
+        assert record.asset_observation is not None, "only observations are fetched"
+        body = json.loads(str(record.asset_observation.metadata[_BODY].value))
+        yield dg.RunRequest(
+            run_key=body["name"],
+            asset_selection=[asset_key(name) for name in body["stages"]],
+            tags={**body["tags"], REQUEST_TAG: body["name"]},
+        )
+
+
+@dg.sensor(
+    asset_selection=dg.AssetSelection.all(),
+    minimum_interval_seconds=INTERVAL_S,
+    default_status=dg.DefaultSensorStatus.RUNNING,
+    description="Puts the runs into the queue that `traps run --cluster` asks for.",
+)
+def start_requested_runs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
+    """For studies whose runs go to a cluster. The cursor has a place for each study: they may share a history."""
+    study, cursors = _study_here(), json.loads(context.cursor or "{}")
+    result = context.instance.fetch_observations(_key(study), AT_ONCE, cursors.get(study), ascending=True)
+    cursors[study] = result.cursor
+    return dg.SensorResult([*_requests(result)], cursor=json.dumps(cursors))
