@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pandas as pd
 
@@ -37,7 +38,7 @@ def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:
         rows = [row(ITEMS, dataset=dataset, item_id=item, pair_id=pair, side=side) for item, pair, side in items]
         tables.write(ITEMS, {"dataset": dataset}, rows, {})
         for cell, mine in part.groupby(["dataset", "model", "regime", "run"]):
-            where = {name: value for name, value in zip(("dataset", "model", "regime", "run"), cell, strict=True)}
+            where: dict[str, Any] = dict(zip(("dataset", "model", "regime", "run"), cell, strict=True))
             tables.write(VERDICTS, where, mine.reset_index(drop=True), {})
             cast = [
                 row(VOTES, item_id=item, side=side, task="abstention", judge=judge, valid=True, panel=panel_id("rules"),
