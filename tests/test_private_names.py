@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.test_rooms import PACKAGE
 
+PACKAGE = ROOT / "traps_pipeline"
 # Each private name of a library, with its library, the files that use it and why no public name will do.
 PRIVATE = {
     "dagster._core.definitions.source_asset": ("dagster", "orchestration/step.py", "hands on without an event"),

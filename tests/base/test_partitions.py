@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.partitions import (
     ALL_CATEGORIES,
     BESIDE,
@@ -35,7 +36,7 @@ def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None
 def test_steering_keys_of_a_study_with_arms_are_read_though_no_arm_is_steered() -> None:
     cells = [SteeringCell.make(dataset, "pocket", "standard", "guided") for dataset in (*DATASETS, *BESIDE)]
     assert all(SteeringCell.parse(cell.key) == cell for cell in cells)
-    with pytest.raises(ValueError, match="is not dataset"):
+    with raises(ValueError, "base.partitions.SteeringCell.parse"):
         SteeringCell.parse("pachinko|pocket__standard__guided")
 
 
@@ -55,13 +56,13 @@ def test_a_cell_reads_as_the_design_says() -> None:
     ],
 )
 def test_a_wrong_evaluation_key_is_refused(key: str) -> None:
-    with pytest.raises(ValueError, match=r"evaluation key|must match"):
+    with raises(ValueError, "base"):
         Evaluation.parse(key)
 
 
 @pytest.mark.parametrize("key", ["pachinko|m__guided__run1", "m__guided__run1", "occlusion", "|m__guided__run1", ""])
 def test_a_wrong_cell_key_is_refused(key: str) -> None:
-    with pytest.raises(ValueError, match=r"cell key|evaluation key"):
+    with raises(ValueError, "base.partitions"):
         Cell.parse(key)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.directions import origin, pair_states
+from tests.build.mechanism import STANDARD, entry, own, patch, study
 from tests.mechanism.study import PAIRS, SETTINGS, write_verdicts
-from tests.mechanism.test_directions import origin, pair_states
-from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.partitions import StatesCell
 from traps_pipeline.mechanism import stages

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.commitments import committed
 from tests.conftest import Checkout
-from tests.release.test_commitment import committed
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.release.checksums import CHECKSUMS, read_checksums

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.media import IMAGES, VIDEO, write_clip
+from tests.build.video_rows import PARTITION, clip
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
 from tests.storage.conftest import VARIABLE
-from tests.storage.test_media import IMAGES, VIDEO, write_clip
-from tests.storage.test_parquet import PARTITION, clip
 from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.scenes.picture.encode import DamagedClip, count_frames, decode, decode_first
 from traps_pipeline.scenes.worlds.clips import check_clip

@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
+from tests.build.boards import board_of, board_row
 from tests.build.cells import row
+from tests.build.latex import latex_cells
 from tests.conftest import ROOT
-from tests.report.test_report import board_of, board_row
-from tests.report.test_writing import latex_cells
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.cli import main
 from traps_pipeline.judging.tables import JUDGE_BIAS, JUDGE_VALIDATION

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.scoring.test_arms import of_arm, write
+from tests.build.errors import raises
+from tests.build.verdicts import of_arm, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs import scoring
@@ -164,7 +165,7 @@ def test_the_stage_writes_a_table_with_arms_and_an_empty_one_without(
     rows: Rows, tmp_path: Path, arms: dict[str, Pairs]
 ) -> None:
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
-    with pytest.raises(TrapsError, match="materialize verdicts"):
+    with raises(TrapsError, "defs.scoring._make_robust"):
         scoring._make_robust(workspace, None)
     write(workspace, study(rows, [RIGHT], arms))
     made = scoring._make_robust(workspace, None)

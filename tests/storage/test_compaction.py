@@ -21,6 +21,7 @@ from tests.remedies.remedied import remedied
 from tests.storage.conftest import VARIABLE
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import object_name
+from traps_pipeline.cluster.database import Database
 from traps_pipeline.cluster.objects import Bucket, ObjectStore
 from traps_pipeline.storage import compaction
 from traps_pipeline.storage.compaction import Segment, segments_of
@@ -43,7 +44,8 @@ finish(opened(*sys.argv[1:4], Path(sys.argv[4])))
 def opened(database: str, address: str, study: str, scratch: Path) -> SharedLedger:
     """The ledger of a study in an object store, as a host with that scratch folder opens it."""
     session = Session(database, VARIABLE, study)
-    return SharedLedger(session, "answers", ObjectStore(scratch, Bucket(address), session))
+    store = ObjectStore(scratch, Bucket(address), Database(database, session), study, b"anchor")
+    return SharedLedger(session, "answers", store)
 
 
 @pytest.fixture
