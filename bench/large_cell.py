@@ -27,7 +27,7 @@ STAGES = {"responses": CELL, "votes": CELL, "verdicts": CELL, "metrics": "chaoti
 PAGE = """
 import os, sys
 from pathlib import Path
-from traps_pipeline.base.partitions import Cell
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.report.items import item_pages
 from traps_pipeline.storage.workspace import Workspace
 workspace = Workspace.open(Path(os.environ["TRAPS_WORKSPACE"]))

@@ -17,8 +17,9 @@ import numpy as np
 import pandas as pd
 
 from bench.quick import parse
-from traps_pipeline.base.partitions import DATASETS, REGIMES, taxonomy_of
 from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
 from traps_pipeline.scoring.leaderboard import leaderboard

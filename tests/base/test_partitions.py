@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.base.partitions import (
+from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, SteeringCell
+from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
     BESIDE,
     CATEGORIES,
@@ -12,15 +14,11 @@ from traps_pipeline.base.partitions import (
     DATASETS,
     EXTENSION_CATEGORIES,
     OCCLUSION_CATEGORIES,
-    Cell,
-    Evaluation,
-    SteeringCell,
     datasets_of_category,
     is_ill_posed,
     taxonomy_of,
     transfer_type,
 )
-from traps_pipeline.orchestration.wanted import Wanted
 
 
 def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:

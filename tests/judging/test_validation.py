@@ -15,7 +15,6 @@ from statsmodels.stats.inter_rater import cohens_kappa
 
 from tests.judging.conftest import answered_study
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
 from traps_pipeline.judging.confabulation import AXES, sample_id
@@ -28,6 +27,7 @@ from traps_pipeline.judging.validation import (
     read_labels,
 )
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 MODEL = "qwen3-vl-think"

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
-from traps_pipeline.base.partitions import DATASETS, Extraction, StatesCell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism import stages
@@ -32,6 +31,8 @@ from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace

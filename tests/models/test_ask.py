@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import STOPS, Call, Settled, Work, run_work, settle
@@ -23,6 +22,7 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -333,7 +333,7 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 class Slow:

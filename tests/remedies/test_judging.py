@@ -14,7 +14,6 @@ from tests.judging.conftest import answered_study, judge_at
 from tests.judging.test_validation import GOOD, HEAD, MODEL, labelled_study, written
 from tests.providers.server import Provider
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
 from traps_pipeline.judging.labels import LABELS_FILE, label_lines
@@ -25,6 +24,7 @@ from traps_pipeline.judging.validation import annotation_sheet, read_labels, wri
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

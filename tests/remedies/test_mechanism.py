@@ -13,7 +13,6 @@ from tests.mechanism.study import PAIRS, SETTINGS, write_verdicts
 from tests.mechanism.test_directions import origin, pair_states
 from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import remedied
-from traps_pipeline.base.partitions import StatesCell
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.directions import extract_directions, load_directions, save_directions
 from traps_pipeline.mechanism.patched import patching_rows
@@ -22,6 +21,7 @@ from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import StatesCell
 from traps_pipeline.storage.study import Asked, MechanismSettings, PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 

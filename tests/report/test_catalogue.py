@@ -15,10 +15,10 @@ from tests.build.cells import row
 from tests.conftest import ROOT
 from tests.report.test_report import board_of, board_row
 from tests.report.test_writing import latex_cells
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.cli import main
 from traps_pipeline.judging.tables import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES, workspace_files
 from traps_pipeline.report.figures.abstention import doubt_points

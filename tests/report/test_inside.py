@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.mechanism.control_tables import (
     GATE,
     PATCHING,
@@ -24,6 +23,7 @@ from traps_pipeline.mechanism.control_tables import (
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
 from traps_pipeline.report.page import Card, picture_block, report_html

@@ -6,10 +6,10 @@ import pandas as pd
 import pytest
 
 from tests.build.cells import CELL, write_cell
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report import items
 from traps_pipeline.report.items import addresses, index_page, item_pages, page_name, write_item_pages
 from traps_pipeline.report.writing import Behind

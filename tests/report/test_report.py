@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS, REGIMES, SHORT
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs, telling_times
 from traps_pipeline.report.figures.labels import Label, merged_labels

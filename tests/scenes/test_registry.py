@@ -15,8 +15,8 @@ import pytest
 from tests.conftest import ROOT
 from tests.scenes.released import Released
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.benchmark.composition import load_composition
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes import family_registry as registry
 from traps_pipeline.scenes.certification.certify_record import certify

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
     degenerate_strategies,

@@ -10,13 +10,13 @@ import pandas as pd
 import pytest
 
 from tests.build.cells import row
-from traps_pipeline.base.partitions import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs import judging, scoring
 from traps_pipeline.judging.ratings import VOTE_COLUMNS
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
+from traps_pipeline.protocol.datasets import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures

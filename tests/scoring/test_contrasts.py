@@ -11,10 +11,11 @@ from statsmodels.stats.proportion import proportion_confint
 
 from tests.judging.conftest import item_row
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.cli import main
 from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     draw_scenarios,

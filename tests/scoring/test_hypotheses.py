@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import ARMS, BESIDE, DATASETS, VARIATIONS, sides_of
+from traps_pipeline.protocol.datasets import ARMS, BESIDE, DATASETS, VARIATIONS, sides_of
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.hypotheses import hypotheses as printed
 from traps_pipeline.scoring.hypotheses import DATASETS_READ, HYPOTHESES, hypotheses, wrong_rows

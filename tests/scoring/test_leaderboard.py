@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
 from traps_pipeline.scoring.leaderboard import leaderboard, pooled_j, wrong_intervals

@@ -12,8 +12,8 @@ import pytest
 
 from tests.scoring.test_arms import of_arm, write
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs import scoring
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.robust import robust, wrong_rows
 from traps_pipeline.scoring.tables import ROBUST

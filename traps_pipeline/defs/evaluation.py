@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.judging.panel import collect_votes
@@ -19,6 +18,7 @@ from traps_pipeline.orchestration.graph import Check, Collect
 from traps_pipeline.orchestration.previews import Records, StudyFile
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.orchestration.stage import of, source, stage
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -3,17 +3,6 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import (
-    ANSWERABLE,
-    DATASETS,
-    TIME_SWAPPED,
-    Cell,
-    Evaluation,
-    Extraction,
-    StatesCell,
-    SteeringCell,
-    taxonomy_of_category,
-)
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
@@ -57,6 +46,8 @@ from traps_pipeline.orchestration.schemes import (
 )
 from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

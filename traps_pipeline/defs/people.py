@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, responses, verdicts
 from traps_pipeline.defs.judging import confabulation
@@ -10,6 +9,7 @@ from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.stage import of, source, stage
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

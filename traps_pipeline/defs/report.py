@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
@@ -12,6 +11,7 @@ from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.pieces import Files, Piece, make_pieces
 from traps_pipeline.orchestration.previews import Markdown
 from traps_pipeline.orchestration.stage import code_of, is_declared, of, source, stage
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.catalogue import FIGURES, TABLES, Report, workspace_files
 from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ARMS, DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
@@ -12,6 +11,7 @@ from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.previews import Markdown
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import of, stage
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.scoring.tables import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

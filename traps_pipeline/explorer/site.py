@@ -20,13 +20,14 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, sides_of
 from traps_pipeline.base.terminal import finalized
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.explorer.answers import StudyAnswers, study_answers
 from traps_pipeline.explorer.scripts import data_script, parquet_text
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.gallery import certificate_phrases, intervention
 from traps_pipeline.report.leaderboard import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults

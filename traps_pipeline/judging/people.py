@@ -18,7 +18,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol
@@ -28,6 +27,7 @@ from traps_pipeline.judging.validation import sheet_rows
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
 TaskName = Literal["answerability", "confabulation", "abstention", "correctness"]

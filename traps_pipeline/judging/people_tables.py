@@ -7,6 +7,7 @@ from typing import Annotated
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.protocol.regimes import REGIMES, one_of
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
@@ -28,7 +29,7 @@ class HumanLabelRow:
     scenario_id: shared.ScenarioId
     side: shared.Side
     model: Annotated[str | None, "whose answer was labelled; null for a clip"]
-    regime: Annotated[str | None, "standard, guided or json; null for a clip"]
+    regime: Annotated[str | None, f"{one_of(REGIMES)}; null for a clip"]
     run: Annotated[int | None, "run of the answer; null for a clip"]
     stratum: Annotated[str, "group that it was sampled from, and whether the judges are split about it"]
     stratum_size: Annotated[int, "units of the stratum in the study"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import permutations, product
 from typing import Literal
 
-from traps_pipeline.base.partitions import ANSWERABLE, DATASETS, LONG, SHORT, taxonomy_of
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, LONG, SHORT, taxonomy_of
 
 Path = tuple[str, str]  # source and target dataset
 PathSet = Literal["transfer", "within_domain"]

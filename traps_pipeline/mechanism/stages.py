@@ -11,14 +11,6 @@ import numpy as np
 from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import (
-    DATASETS,
-    Cell,
-    Evaluation,
-    Extraction,
-    StatesCell,
-    is_ill_posed,
-)
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.directions import (
     Directions,
@@ -47,6 +39,8 @@ from traps_pipeline.mechanism.tables import (
 from traps_pipeline.mechanism.versions import states_folder
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.workspace import Workspace
 

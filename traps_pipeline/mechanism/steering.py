@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import SIDES, Extraction, SteeringCell, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.deciding import Gate, conditions
@@ -40,6 +39,8 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.cells import Extraction, SteeringCell
+from traps_pipeline.protocol.datasets import SIDES, taxonomy_of
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from traps_pipeline.protocol.regimes import VQA_PROMPTS, one_of
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
-Prompt = Annotated[str, "prompt of extraction, standard or guided: a VQA one, or the benchmark's if so set"]
+Prompt = Annotated[str, f"prompt of extraction, {one_of(VQA_PROMPTS)}: a VQA one, or the benchmark's if so set"]
 Layer = Annotated[int, "counted as in hidden_states"]
 Pooling = Annotated[str, "last (token of the prompt), answer (its first token), or mean over all tokens or a part"]
 Target = Annotated[str, "the target: one of four"]

@@ -16,7 +16,6 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.benchmark.items import item_hash
 from traps_pipeline.benchmark.tables import ITEMS
@@ -31,6 +30,9 @@ from traps_pipeline.models.reading import degenerate
 from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.submission import Submission
 from traps_pipeline.scoring.board import Scored, score
 from traps_pipeline.scoring.tables import LEADERBOARD, METRICS

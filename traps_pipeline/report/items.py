@@ -18,12 +18,14 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.answers import UNREAD
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import BESIDE, DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.terms import ARM_TITLES, TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
 from traps_pipeline.storage.workspace import Workspace

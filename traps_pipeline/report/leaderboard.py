@@ -11,8 +11,9 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.base.partitions import ARMS, DATASETS, REGIMES, SHORT
 from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
+from traps_pipeline.protocol.datasets import ARMS, DATASETS, SHORT
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.shared import (
     EPOCH,
     MISSING,

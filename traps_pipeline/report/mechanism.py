@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pandas as pd
 
-from traps_pipeline.base.partitions import LONG
 from traps_pipeline.mechanism.tables import COSINES, PROBES, STEERING_EFFECTS
+from traps_pipeline.protocol.datasets import LONG
 from traps_pipeline.scoring.published import published
 from traps_pipeline.storage.tables import Table
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.cases import cases_files
 from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from traps_pipeline.base.partitions import DATASETS, PROBE_PROMPT
 from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT
 from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
@@ -23,6 +22,8 @@ from traps_pipeline.mechanism.control_tables import (
     STEERING_PECS,
 )
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT
 from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.scoring.tables import (
     CONFABULATION_PREVALENCE,

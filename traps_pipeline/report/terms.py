@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.base.partitions import ARMS, VARIATIONS
+from traps_pipeline.protocol.datasets import ARMS, VARIATIONS
 from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW
 
 TITLES = {

@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, REGIMES
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import (
     ENTRY,
     RESAMPLED,

@@ -14,9 +14,9 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.judging.labels import truths
 from traps_pipeline.judging.people import ABOUT_ANSWERS, TaskName
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,

@@ -14,7 +14,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import datasets_of_category
+from traps_pipeline.protocol.datasets import datasets_of_category
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
 from traps_pipeline.scoring.metrics import BOUNDS, BROKEN, COUNTED, FIGURES, decision_counts, joined_epochs, mean
 from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD

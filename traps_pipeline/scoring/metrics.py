@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from traps_pipeline.base.partitions import sides_of
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.protocol.datasets import sides_of
 from traps_pipeline.scoring.tables import METRICS
 
 if TYPE_CHECKING:

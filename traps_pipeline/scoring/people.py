@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import taxonomy_of
 from traps_pipeline.judging.labels import agreement_of, matrix
+from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,

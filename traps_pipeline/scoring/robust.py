@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import (
+from traps_pipeline.protocol.datasets import (
     ANSWERABLE_ARMS,
     ARMS,
     DATASETS,

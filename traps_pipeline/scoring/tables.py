@@ -199,7 +199,7 @@ class RobustRow:
 
     model: shared.Model
     regime: shared.Regime
-    arms: Annotated[list[str], "arms (of partitions.ARMS) in the figures; entries with other arms are not compared"]
+    arms: Annotated[list[str], "arms (of datasets.ARMS) in the figures; entries with other arms are not compared"]
     n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
     n_items: Annotated[int, "items per run, of the four datasets and the arms"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]

@@ -13,10 +13,11 @@ import yaml
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.base.partitions import DATASETS, REGIMES
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.judges import RULES_PANEL, panel_id
 from traps_pipeline.models.registry import PROTOCOL
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST

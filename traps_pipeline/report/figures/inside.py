@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import DATASETS, SHORT
 from traps_pipeline.mechanism.directions import NULLS
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import arrow, frame_plane
 from traps_pipeline.report.results import Results, datasets_of
 from traps_pipeline.report.tables.beside import SHORTCUTS
@@ -107,7 +108,7 @@ def gate_arrows(results: Results) -> Figure:
         return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
     from matplotlib.lines import Line2D
 
-    regimes = [name for name in ("standard", "guided") if name in set(rows["regime"])]
+    regimes = [name for name in PROMPTING if name in set(rows["regime"])]
     colour = _colours(_FEATURES)
     rows = rows.assign(j=rows["abs_rec"] - rows["false_abs"], plain_j=rows["plain_abs_rec"] - rows["plain_false_abs"])
     with figure_style():

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
+from traps_pipeline.protocol.datasets import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.mechanism import why
 from traps_pipeline.report.tables.probes import best_layers

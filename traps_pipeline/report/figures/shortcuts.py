@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import COLOURS, COLUMN_IN, MARKERS, figure_style, new_figure
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.printed.shared import figures, in_text, of_paper, with_spread
 from traps_pipeline.report.tables.shared import DATASET, MODEL, titled
 from traps_pipeline.report.terms import TITLES
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SHARES = {"acc_pct": "Acc %", "abs_rec_pct": "AbsRec %", "false_abs_pct": "FalseAbs %", "pecs": "PECS"}
 SPREADS = ("acc_std", "abs_rec_std", "false_abs_std", "pecs_std")
-REGIMES = ("standard", "json", "guided")  # in the paper's order
+PRINTED_REGIMES = ("standard", "json", "guided")  # in the paper's order
 REGIME = Column("regime", "Regime", look="tag")
 
 
@@ -26,7 +26,7 @@ def overall() -> list[PrintedTable]:
     rows = as_printed("overall")
     wide: pd.DataFrame = rows.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
-    for regime in REGIMES:
+    for regime in PRINTED_REGIMES:
         names = {field: f"{regime}_{field}" for field in SHARES}
         part = rows.loc[rows["regime"] == regime, ["model", *names]]
         wide = wide.merge(part.rename(columns=names), on="model")
@@ -45,7 +45,7 @@ def per_dataset() -> list[PrintedTable]:
     wide: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
     for dataset in DATASETS:
-        for regime in REGIMES:
+        for regime in PRINTED_REGIMES:
             part = _of(cells, dataset, regime).loc[:, ["model", "pecs"]]
             name = f"{dataset}_{regime}"
             wide = wide.merge(part.rename(columns={"pecs": name}), on="model")
@@ -58,14 +58,14 @@ def expanded() -> list[PrintedTable]:
     cells = _cells("main")
     order = ("acc_pct", "false_abs_pct", "abs_rec_pct", "pecs")
     columns = [MODEL, *figures({field: SHARES[field] for field in order})]
-    keys = [(dataset, regime) for dataset in DATASETS for regime in REGIMES]
+    keys = [(dataset, regime) for dataset in DATASETS for regime in PRINTED_REGIMES]
     return [of_paper(f"expanded_{'_'.join(key)}", _of(cells, *key), columns) for key in keys]
 
 
 def replication_per_dataset() -> list[PrintedTable]:
     """The two replication families on each dataset under each regime."""
     cells = _cells("replication")
-    keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in REGIMES]
+    keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in PRINTED_REGIMES]
     cells = titled(cells.set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
     return [of_paper("replication_per_dataset", cells, [MODEL, DATASET, REGIME, *figures(SHARES)])]
 

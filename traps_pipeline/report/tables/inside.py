@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
 from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT
+from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
+from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.beside import SHORTCUTS, against
 from traps_pipeline.report.tables.mechanism import DIRECTIONS, FEW, INFERENCE, few, why
@@ -324,7 +325,7 @@ def prompts(results: Results) -> pd.DataFrame:
     plain = results.gate.loc[results.gate["target"].isin(DATASETS)].rename(columns={"target": "dataset"})
     plain = plain.astype({"regime": object, "dataset": object})
     table = plain.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
-    table = table.reindex(columns=pd.Index(PROMPTED)).add_prefix("said_")
+    table = table.reindex(columns=pd.Index(PROMPTING)).add_prefix("said_")
     table["change"] = table["said_guided"] - table["said_standard"]
     counted = {"n_answered": (plain, "n_voids")}
     own = [results.prompted_probes.loc[results.prompted_probes["source_best"].eq(True)]]
@@ -333,7 +334,7 @@ def prompts(results: Results) -> pd.DataFrame:
         rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
         rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
         wide = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
-        table = table.join(wide.reindex(columns=pd.Index(PROMPTED)).add_prefix(f"{name}_"))
+        table = table.join(wide.reindex(columns=pd.Index(PROMPTING)).add_prefix(f"{name}_"))
         if name == "probe":
             counted |= {count: (rows, count) for count in ("n_voids", "n_controls")}
     for name, (rows, count) in counted.items():
@@ -341,9 +342,6 @@ def prompts(results: Results) -> pd.DataFrame:
     floor = against(results, "held_out")
     floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
     return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
-
-
-PROMPTED = ("standard", "guided")
 
 
 def _prompts(results: Results) -> PrintedTable:
@@ -358,7 +356,7 @@ def _prompts(results: Results) -> PrintedTable:
         Column("said_guided", "guided", "percent", mark="said_mark"),
         Column("change", "guided − standard", "percent", mark="said_mark"),
         *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction", mark="probe_mark")
-          for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTED),
+          for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTING),
         Column("raw", "Best raw input"), Column("raw_value", "its AUROC", "fraction"),
         Column("noise", "Noise", "fraction", spread="noise_spread"),
         Column("n_answered", "Voids answered about", "count"), *_SIDES,

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import SHORT
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.paths import path_name
+from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import MODEL, epochs, rightly_empty
 from traps_pipeline.report.writing import Column, PrintedTable
@@ -55,7 +56,7 @@ def cosines(results: Results) -> list[PrintedTable]:
     columns = [MODEL, Column("layer", "Layer", "count"), Column("prompt", "Prompt"), Column("name", "Direction")]
     matrix = [*columns, *(Column(short, short, "fraction", 2) for short in SHORT.values())]
     across = rows.loc[
-        (rows["prompt"] == "standard") & (rows["other_prompt"] == "guided") & (rows["dataset"] == rows["other_dataset"])
+        (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["dataset"] == rows["other_dataset"])
     ]
     across = across.sort_values(["model", "name"], key=_place, ignore_index=True)
     pair = [
@@ -77,7 +78,7 @@ def cosines(results: Results) -> list[PrintedTable]:
 def _place(values: pd.Series) -> pd.Series:
     if values.name == "name":
         return values.map({short: place for place, short in enumerate(SHORT.values())})
-    orders = {"prompt": ("standard", "guided"), "kind": KINDS}
+    orders = {"prompt": PROMPTING, "kind": KINDS}
     order = orders.get(str(values.name))
     return values if order is None else values.map(order.index)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.base.partitions import SHORT
+from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.inside import FEW_NOTE, LAYER
 from traps_pipeline.report.tables.mechanism import few

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
+from traps_pipeline.protocol.datasets import ANSWERABLE, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import beside
 from traps_pipeline.report.tables.inside import DRAWS, FEW_NOTE
