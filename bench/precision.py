@@ -25,7 +25,7 @@ from traps_pipeline.protocol.datasets import DATASETS, SIDES, datasets_of_catego
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.power import Shares, precision
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import LITE_FILE, load_experiment
 

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.contrast import ccs as ccs
 from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.deciding import Gate, Threshold, fitted_gate

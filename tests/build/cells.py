@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 

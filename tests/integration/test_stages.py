@@ -15,10 +15,10 @@ import yaml
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging import panel
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -14,7 +14,7 @@ import pytest
 from tests.conftest import KEY
 from tests.providers.server import Provider
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
-from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models import api, participants
 from traps_pipeline.models.answers import answer_request, response_row
 from traps_pipeline.models.judges import JudgeEntry

@@ -18,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
 from traps_pipeline.judging.confabulation import AXES, sample_id
-from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION, ConfabulationRow
+from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION, ConfabulationRow
 from traps_pipeline.judging.validation import (
     LABEL_COLUMNS,
     HumanLabels,

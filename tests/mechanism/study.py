@@ -12,7 +12,7 @@ import pytest
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry

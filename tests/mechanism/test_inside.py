@@ -25,11 +25,11 @@ from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.other_probes import Eraser
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probes import auroc, scenario_folds
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry

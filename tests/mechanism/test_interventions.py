@@ -22,10 +22,10 @@ from traps_pipeline.mechanism import stages, steering
 from traps_pipeline.mechanism.deciding import conditions
 from traps_pipeline.mechanism.directions import steered_scenarios
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, STEERING, SteeringRow
 from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.probing_versions import loaded_params, steering_version
 from traps_pipeline.mechanism.steering import NO_STEERING, Strength, collect_steered, steered_request
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, STEERING, SteeringRow
-from traps_pipeline.mechanism.versions import loaded_params, steering_version
 from traps_pipeline.models.local.adapter import Prompt, load_local_model
 from traps_pipeline.models.local.prefixes import PrefixMemory
 from traps_pipeline.models.local.spans import spans

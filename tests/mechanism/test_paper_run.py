@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import Checkout
 from tests.mechanism.paper_run import BLOCKS, DEPTHS, mechanism, paper, write
-from traps_pipeline.mechanism.tables import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 

@@ -26,6 +26,14 @@ from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.baselines import baseline_rows
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.mechanism_rows import (
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING,
+    STEERING_VOTES,
+)
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.shares import effect_rows, of_paper
@@ -37,7 +45,6 @@ from traps_pipeline.mechanism.steering import (
     strengths,
 )
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.orchestration.graph import the_graph

@@ -20,7 +20,7 @@ from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
 from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.exchange import Whose, import_answers

@@ -15,9 +15,9 @@ from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import remedied
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.directions import extract_directions, load_directions, save_directions
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.patched import patching_rows
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.orchestration.wanted import Wanted

@@ -12,15 +12,15 @@ import pytest
 from tests.build.cells import row
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs import judging, scoring
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.ratings import VOTE_COLUMNS
-from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.protocol.datasets import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
-from traps_pipeline.scoring.tables import CONTRASTS, METRICS
+from traps_pipeline.scoring.score_rows import CONTRASTS, METRICS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.protocol.datasets import ARMS, BESIDE, DATASETS, VARIATIONS, sides_of
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.hypotheses import hypotheses as printed
-from traps_pipeline.scoring.hypotheses import DATASETS_READ, HYPOTHESES, hypotheses, wrong_rows
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.hypothesis_tables import hypotheses as printed
+from traps_pipeline.scoring.doses import DATASETS_READ, HYPOTHESES, hypotheses, wrong_rows
 
 Rows = Callable[..., pd.DataFrame]
 

@@ -14,7 +14,7 @@ from traps_pipeline.defs.mechanism import (
     steers,
 )
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.mechanism.control_tables import (
+from traps_pipeline.mechanism.control_rows import (
     GATE,
     PATCHING,
     PROBE_BASELINES,
@@ -22,8 +22,8 @@ from traps_pipeline.mechanism.control_tables import (
     STEERING_NULLS,
     STEERING_PECS,
 )
-from traps_pipeline.mechanism.tables import STEERING_EFFECTS
-from traps_pipeline.mechanism.versions import patching_version
+from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
+from traps_pipeline.mechanism.probing_versions import patching_version
 from traps_pipeline.models.registry import ModelEntry, local_models
 from traps_pipeline.orchestration.partitioning import EVERY, SAME
 from traps_pipeline.orchestration.schemes import CELL, EXTRACTION, by_extraction, these_keys

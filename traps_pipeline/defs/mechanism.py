@@ -7,7 +7,7 @@ from traps_pipeline.base.progress import Tally
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.mechanism.tables import (
+from traps_pipeline.mechanism.mechanism_rows import (
     COSINES,
     DIRECTIONS,
     HIDDEN_STATES,
@@ -18,8 +18,8 @@ from traps_pipeline.mechanism.tables import (
     STEERING_VOTES,
     ProbeRow,
 )
-from traps_pipeline.mechanism.tables import STEERING as STEERING_TABLE
-from traps_pipeline.mechanism.versions import (
+from traps_pipeline.mechanism.mechanism_rows import STEERING as STEERING_TABLE
+from traps_pipeline.mechanism.probing_versions import (
     directions_are_there,
     extraction_version,
     probing_version,

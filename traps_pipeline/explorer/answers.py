@@ -17,8 +17,8 @@ import pyarrow.compute
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
-from traps_pipeline.judging.answers import UNREAD
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judged_answers import UNREAD
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SIDES

@@ -29,13 +29,13 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.gallery import certificate_phrases, intervention
-from traps_pipeline.report.leaderboard import legend, provenance
+from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.tables.people import said_by_people
-from traps_pipeline.report.tables.shared import entries
+from traps_pipeline.report.tables.human_tables import said_by_people
+from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
-from traps_pipeline.scoring.people_tables import HUMAN_ROW, PANEL_ERRORS
-from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
+from traps_pipeline.scoring.human_score_rows import HUMAN_ROW, PANEL_ERRORS
+from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, TASKS, YES, Ratings, majority, ratings
-from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.protocol.datasets import DATASETS
 
 

@@ -23,8 +23,8 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
-from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
 from traps_pipeline.models.participants import Row, when_asked

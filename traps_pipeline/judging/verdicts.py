@@ -9,7 +9,8 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.answers import UNREAD
+from traps_pipeline.judging.judged_answers import UNREAD
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.ratings import (
     ABSTENTION,
     ANSWER,
@@ -20,7 +21,6 @@ from traps_pipeline.judging.ratings import (
     majority,
     ratings,
 )
-from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.mechanism.directions import KINDS
-from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
+from traps_pipeline.mechanism.transfer_paths import FAMILIES, PATH_SETS
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.protocol.regimes import GUIDED
 

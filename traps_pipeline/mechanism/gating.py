@@ -12,9 +12,9 @@ import pandas as pd
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
-from traps_pipeline.mechanism.control_tables import GateRow, RiskCoverageRow
+from traps_pipeline.mechanism.control_rows import GateRow, RiskCoverageRow
 from traps_pipeline.mechanism.gate import (
     MID,
     OTHER_DATASETS,
@@ -30,11 +30,11 @@ from traps_pipeline.mechanism.gate import (
     separation,
     sources_of_gate,
 )
+from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.mechanism.nulls import nulled
-from traps_pipeline.mechanism.paths import probed_taxonomy
 from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import PROBES
+from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS

@@ -13,7 +13,7 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.items import categories_of_dataset
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
-from traps_pipeline.mechanism.tables import ProbeItemRow
+from traps_pipeline.mechanism.mechanism_rows import ProbeItemRow
 from traps_pipeline.protocol.datasets import ANSWERABLE, TIME_SWAPPED
 from traps_pipeline.storage.workspace import Workspace
 

@@ -28,10 +28,10 @@ from traps_pipeline.mechanism.deciding import Gate, conditions
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
-from traps_pipeline.mechanism.paths import sources_of
+from traps_pipeline.mechanism.mechanism_rows import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
+from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
-from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
-from traps_pipeline.mechanism.versions import loaded_params
+from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel

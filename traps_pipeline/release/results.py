@@ -23,7 +23,7 @@ from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.submission import table_bytes
 from traps_pipeline.scoring.bootstrap import RESAMPLES
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of

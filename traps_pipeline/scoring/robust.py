@@ -35,7 +35,7 @@ from traps_pipeline.scoring.bootstrap import (
     run_sums,
 )
 from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
-from traps_pipeline.scoring.tables import ROBUST
+from traps_pipeline.scoring.score_rows import ROBUST
 
 TWIN = "twin_control"
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))

@@ -18,7 +18,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.answers import UNREAD
+from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import Call, Settled, collect

@@ -11,8 +11,8 @@ from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.benchmark.items import expected_items
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
-from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
 from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of

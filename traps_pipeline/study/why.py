@@ -8,7 +8,7 @@ from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.models.tables import RESPONSES

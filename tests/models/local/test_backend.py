@@ -19,7 +19,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.cli import main
-from traps_pipeline.mechanism.versions import loaded_params
+from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models import registry
 from traps_pipeline.models.ask import Call, Settled, Work, run_work
 from traps_pipeline.models.backends import make_backend

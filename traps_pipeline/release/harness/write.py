@@ -33,7 +33,7 @@ _COPIED = {
     "models/endings.py": "endings.py",
     "models/thinking.py": "thinking.py",
     "models/reading.py": "reading.py",
-    "judging/answers.py": "answers.py",
+    "judging/judged_answers.py": "answers.py",
     "judging/rules.py": "rules.py",
     "release/harness/scoring.py": "scoring.py",
     "release/harness/items.py": "items.py",

@@ -9,7 +9,7 @@ import numpy as np
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import (
     COLUMN_IN,

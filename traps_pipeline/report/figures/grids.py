@@ -8,7 +8,7 @@ import numpy as np
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
 from traps_pipeline.scoring import analyses
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
-from traps_pipeline.report.figures.labels import LINES, Label, merged_labels, place_labels, short
+from traps_pipeline.report.figures.label_placement import LINES, Label, merged_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
-from traps_pipeline.report.results import Results, datasets_of
+from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import (
     COLUMN_IN,

@@ -10,8 +10,8 @@ import numpy as np
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     COUNTED,
     COUNTS,
     DATASET,

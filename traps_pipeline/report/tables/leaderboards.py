@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     COUNTS,
     DATASET,
     EPOCH,

@@ -25,8 +25,8 @@ from traps_pipeline.scoring.bootstrap import (
     means_over_runs,
     run_sums,
 )
+from traps_pipeline.scoring.human_score_rows import HUMAN_ROW
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts
-from traps_pipeline.scoring.people_tables import HUMAN_ROW
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:

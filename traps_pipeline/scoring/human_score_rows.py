@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.scoring.tables import Bootstrap, DatasetOrOverall, Mean
+from traps_pipeline.scoring.score_rows import Bootstrap, DatasetOrOverall, Mean
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 

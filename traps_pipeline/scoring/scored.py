@@ -8,8 +8,8 @@ import pandas as pd
 
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
-from traps_pipeline.scoring.leaderboard import leaderboard
 from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.scoring.standings import leaderboard
 
 
 @dataclass(frozen=True)

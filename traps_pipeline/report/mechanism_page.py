@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from traps_pipeline.mechanism.tables import COSINES, PROBES, STEERING_EFFECTS
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.protocol.datasets import LONG
 from traps_pipeline.scoring.published import published
 from traps_pipeline.storage.tables import Table

@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
 from traps_pipeline.report.writing import Behind, Column, PrintedTable, fraction
 

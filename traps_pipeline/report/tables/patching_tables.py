@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from traps_pipeline.protocol.datasets import SHORT
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.inside import FEW_NOTE, LAYER
-from traps_pipeline.report.tables.mechanism import few
-from traps_pipeline.report.tables.shared import MODEL
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.control_reports import FEW_NOTE, LAYER
+from traps_pipeline.report.tables.steering_tables import few
+from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 SITES = {"residual": "residual stream", "attention": "attention", "mlp": "MLP"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.writing import Column
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.answers import UNREAD
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judged_answers import UNREAD
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation

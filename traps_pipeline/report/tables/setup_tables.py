@@ -7,8 +7,8 @@ from typing import Any
 
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     MODEL,
     frame,
 )

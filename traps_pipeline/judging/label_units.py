@@ -21,8 +21,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol
-from traps_pipeline.judging.people_tables import PROTOCOL_FILE
-from traps_pipeline.judging.tables import CONFABULATION, VERDICTS
+from traps_pipeline.judging.human_label_rows import PROTOCOL_FILE
+from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS
 from traps_pipeline.judging.validation import sheet_rows
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.report.printed.shared import figures, in_text, of_paper, with_spread
-from traps_pipeline.report.tables.shared import DATASET, MODEL, titled
+from traps_pipeline.report.printed.printed_columns import figures, in_text, of_paper, with_spread
+from traps_pipeline.report.tables.table_columns import DATASET, MODEL, titled
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.analyses import models_of

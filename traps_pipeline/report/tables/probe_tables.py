@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
+from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.protocol.datasets import ANSWERABLE, transfer_type
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables import beside
-from traps_pipeline.report.tables.inside import DRAWS, FEW_NOTE
-from traps_pipeline.report.tables.mechanism import PATH, TYPE, few, short_names, why
-from traps_pipeline.report.tables.shared import MODEL
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables import probe_baselines
+from traps_pipeline.report.tables.control_reports import DRAWS, FEW_NOTE
+from traps_pipeline.report.tables.steering_tables import PATH, TYPE, few, short_names, why
+from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _pairs(results: Results) -> pd.DataFrame:
     for analysis, prefix in (
         ("transfer", ""), ("confabulated", "cf_"), ("held_out", "held_"), ("confabulated_held_out", "cf_held_"),
     ):  # fmt: skip
-        rows = rows.merge(beside.against(results, analysis, prefix), on=beside.KEYS, how="left")
+        rows = rows.merge(probe_baselines.against(results, analysis, prefix), on=probe_baselines.KEYS, how="left")
     marks = {"mark": few(rows, "best_n_voids", "best_n_controls"), "cf_mark": few(rows, "cf_n_voids", "cf_n_controls")}
     return rows.assign(**marks)
 
@@ -98,7 +98,7 @@ def _transfer(results: Results) -> PrintedTable:
         Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
         Column("source_layer", "Source’s layer", "count"), Column("source_value", "AUROC there", "fraction"),
-        *_held_out(results), *beside.columns(results), *([] if results.is_study else cf),
+        *_held_out(results), *probe_baselines.columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -106,7 +106,7 @@ def _transfer(results: Results) -> PrintedTable:
         "own grouped cross-validation, which uses no label of a target",
         *_shared_controls(results),
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
-        *beside.notes(results),
+        *probe_baselines.notes(results),
         *_few_note([] if not len(rows) else rows["mark"].tolist()),
     ]
     title = "Probe transfer: AUROC by ordered pair"
@@ -124,7 +124,7 @@ def _confabulated(results: Results) -> PrintedTable:
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), Column("cf_low", "from", "fraction"),
         Column("cf_high", "to", "fraction"), *_held_out(results, "cf_"),
         Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
-        *beside.columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
+        *probe_baselines.columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
         Column("cf_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -132,7 +132,7 @@ def _confabulated(results: Results) -> PrintedTable:
         "control; best layer: that of all samples",
         *_shared_controls(results),
         *silent,
-        *beside.notes(results),
+        *probe_baselines.notes(results),
         *_few_note([] if not len(rows) else rows["cf_mark"].tolist()),
     ]
     absent = why(results) if results.is_study else "the paper has these figures in its table of probe transfer"
@@ -159,12 +159,12 @@ def _means(results: Results) -> PrintedTable:
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("source_value", "Source’s layer", "fraction", mark="mark"),
-        *_held_out(results), *beside.columns(results),
+        *_held_out(results), *probe_baselines.columns(results),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
         Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
-        *beside.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"), *_fewest(results),
+        *probe_baselines.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"), *_fewest(results),
     ]  # fmt: skip
-    notes = [*_shared_controls(results), *beside.notes(results)]
+    notes = [*_shared_controls(results), *probe_baselines.notes(results)]
     notes += _few_note([] if not len(rows) else [*rows["mark"], *rows["cf_mark"]])
     if results.is_study:
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
@@ -219,7 +219,7 @@ def _within(results: Results) -> PrintedTable:
     itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["source_best"]]
     itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
     table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
-    table = table.merge(beside.against(results, "held_out"), on=beside.KEYS, how="left")
+    table = table.merge(probe_baselines.against(results, "held_out"), on=probe_baselines.KEYS, how="left")
     table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
@@ -230,13 +230,13 @@ def _within(results: Results) -> PrintedTable:
     if results.is_study:
         columns += [
             Column("pooled", "Over all folds", "fraction"), Column("low", "from", "fraction"),
-            Column("high", "to", "fraction"), *beside.columns(results), Column("n_voids", "Voids", "count"),
+            Column("high", "to", "fraction"), *probe_baselines.columns(results), Column("n_voids", "Voids", "count"),
             Column("n_controls", "Controls", "count"),
         ]  # fmt: skip
         notes += [
             "AUROC: mean over folds; over all folds: of the scores of all folds together, with its 95 % interval from "
             "resampled scenarios; baselines are to be compared with it",
-            *beside.NOTES,
+            *probe_baselines.NOTES,
         ]
     notes += _few_note(table["mark"].tolist())
     title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
@@ -296,7 +296,9 @@ def _caught_beside(results: Results) -> pd.DataFrame:
     wide = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
     wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
     wide = wide.assign(above=wide["centroid_void"] - wide["centroid_control"])
-    raw = wide.loc[wide["features"].isin(beside.SHORTCUTS)].sort_values("above", ascending=False, kind="stable")
+    raw = wide.loc[wide["features"].isin(probe_baselines.SHORTCUTS)].sort_values(
+        "above", ascending=False, kind="stable"
+    )
     kinds = {"raw": raw.drop_duplicates(keys), "margin": wide.loc[wide["features"] == "output margin"]}
     kinds["noise"] = wide.loc[wide["features"] == "noise"]
     table = kinds["raw"].rename(columns={"features": "raw"})[[*keys, "raw"]]
@@ -311,21 +313,23 @@ def _answerable(results: Results) -> PrintedTable:
     own = (rows["target"] == ANSWERABLE) & rows["source_best"].eq(True)
     table: pd.DataFrame | None = None
     for analysis in ("answerable_void", "answerable_control"):
-        part = rows.loc[own & (rows["analysis"] == analysis), [*beside.KEYS, "layer", "value", "n_voids", "n_controls"]]
+        part = rows.loc[
+            own & (rows["analysis"] == analysis), [*probe_baselines.KEYS, "layer", "value", "n_voids", "n_controls"]
+        ]
         part = part.assign(mark=few(part, "n_voids", "n_controls")).merge(
-            beside.against(results, analysis, f"{analysis}_"), on=beside.KEYS, how="left"
+            probe_baselines.against(results, analysis, f"{analysis}_"), on=probe_baselines.KEYS, how="left"
         )
         part = part.rename(columns={name: f"{analysis}_{name}" for name in ("value", "mark", "n_voids", "n_controls")})
-        table = part if table is None else table.merge(part, on=[*beside.KEYS, "layer"], how="outer")
+        table = part if table is None else table.merge(part, on=[*probe_baselines.KEYS, "layer"], how="outer")
     assert table is not None
     table = table.assign(dataset=short_names(table["source"]))
     columns = [
         MODEL, Column("dataset", "Source"), Column("layer", "Source’s layer", "count"),
         Column("answerable_void_value", "Unanswerable against answerable", "fraction", mark="answerable_void_mark"),
-        *beside.columns(results, "answerable_void_"),
+        *probe_baselines.columns(results, "answerable_void_"),
         Column("answerable_control_value", "Answerable void against control", "fraction",
                mark="answerable_control_mark"),
-        *beside.columns(results, "answerable_control_", "Second: "),
+        *probe_baselines.columns(results, "answerable_control_", "Second: "),
         Column("answerable_void_n_controls", "Answerable", "count"),
         Column("answerable_void_n_voids", "Voids", "count"),
         Column("answerable_control_n_controls", "Controls", "count"),
@@ -333,7 +337,7 @@ def _answerable(results: Results) -> PrintedTable:
     notes = [
         "answerable: void clips of occlusion with a question that they answer. First column: the same clips with both "
         "questions; 0.5 if a probe detects a hidden object, 1 if it detects an unknowable answer. Second: the reverse",
-        *beside.notes(results),
+        *probe_baselines.notes(results),
         *_few_note([*table["answerable_void_mark"].dropna(), *table["answerable_control_mark"].dropna()]),
     ]
     absent = why(results) if results.is_study else "the paper has no such control"

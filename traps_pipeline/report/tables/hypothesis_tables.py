@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import MODEL, REGIME, ordered
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, ordered
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, percent
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from traps_pipeline.scoring.hypotheses import Hypothesis
+    from traps_pipeline.scoring.doses import Hypothesis
 
 WHY = "no variation was run (traps run hypotheses)"
 _TITLES = {
@@ -27,7 +27,7 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 def hypotheses(results: Results) -> list[PrintedTable]:
     """How answers and abstentions change when one thing of the pairs is changed step by step, beside what rules get."""
-    from traps_pipeline.scoring.hypotheses import HYPOTHESES
+    from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
-from traps_pipeline.mechanism.paths import path_name
+from traps_pipeline.mechanism.transfer_paths import path_name
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import MODEL, epochs, rightly_empty
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import MODEL, epochs, rightly_empty
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
+from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
 from traps_pipeline.protocol.datasets import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.mechanism import why
-from traps_pipeline.report.tables.probes import best_layers
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.probe_tables import best_layers
+from traps_pipeline.report.tables.steering_tables import why
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
 
 if TYPE_CHECKING:

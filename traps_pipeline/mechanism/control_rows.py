@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.mechanism.tables import AnswerRegime, Block, DirectionPrompt, Dose, DoseUnit, Prompt, Signs
+from traps_pipeline.mechanism.mechanism_rows import AnswerRegime, Block, DirectionPrompt, Dose, DoseUnit, Prompt, Signs
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.report.printed.shared import figures, in_text, of_paper
+from traps_pipeline.report.printed.printed_columns import figures, in_text, of_paper
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.published import as_printed
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from traps_pipeline.report.printed.shared import figures, in_text, of_paper
-from traps_pipeline.report.tables.shared import DATASET, MODEL, titled
+from traps_pipeline.report.printed.printed_columns import figures, in_text, of_paper
+from traps_pipeline.report.tables.table_columns import DATASET, MODEL, titled
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.published import as_printed

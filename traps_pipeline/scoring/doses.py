@@ -29,7 +29,7 @@ from traps_pipeline.scoring.bootstrap import (
     shares_of,
 )
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs
-from traps_pipeline.scoring.tables import HYPOTHESES as TABLE
+from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
 
 VISUAL = ("occlusion", "chaotic")
 RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by one cue alone

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     DATASET,
     MISSING,
     MODEL,

@@ -14,7 +14,7 @@ import pandas as pd
 from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
 from traps_pipeline.protocol.datasets import ARMS, DATASETS, SHORT
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.report.tables.table_columns import (
     EPOCH,
     MISSING,
     MODEL,
@@ -49,7 +49,7 @@ from traps_pipeline.report.writing import (
 )
 from traps_pipeline.scoring.analyses import of_several_runs
 from traps_pipeline.scoring.metrics import joined_epochs
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 
 BOUNDS = "If missing: worst, best"
 # Columns that are shown only if their count, or that of another field, is not 0, because the table is wide already.

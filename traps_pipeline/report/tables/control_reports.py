@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
-from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT
+from traps_pipeline.mechanism.mechanism_rows import CLAMP, PROJECT_OUT
+from traps_pipeline.mechanism.transfer_paths import path_name, probed_taxonomy
 from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.beside import SHORTCUTS, against
-from traps_pipeline.report.tables.mechanism import DIRECTIONS, FEW, INFERENCE, few, why
-from traps_pipeline.report.tables.shared import MODEL
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.probe_baselines import SHORTCUTS, against
+from traps_pipeline.report.tables.steering_tables import DIRECTIONS, FEW, INFERENCE, few, why
+from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import pandas as pd
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
 from traps_pipeline.scoring.metrics import BOUNDS, BROKEN, COUNTED, FIGURES, decision_counts, joined_epochs, mean
-from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
+from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
 
 _RUN = ["model", "regime", "run"]
 _SUMMED = ["n_missing", "n_items", *COUNTED]
