@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.mechanism.mechanism_rows import AnswerRegime, Block, DirectionPrompt, Dose, DoseUnit, Prompt, Signs
+from traps_pipeline.mechanism.mechanism_rows import Block, Dose, DoseUnit, Extracted, Signs, Steered
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
@@ -11,12 +11,9 @@ Share = Annotated[float | None, "share, 0 to 1"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringNullRow:
+class SteeringNullRow(Steered):
     """The effect of a void direction on its own dataset at the largest dose, ranked among the draws of one null."""
 
-    model: shared.Model
-    directions: DirectionPrompt
-    regime: AnswerRegime
     target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
     layer: Block
     unit: DoseUnit
@@ -45,12 +42,9 @@ STEERING_NULLS = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringPecsRow:
+class SteeringPecsRow(Steered):
     """PECS and its parts of a steered model: one path at one dose under one sign policy."""
 
-    model: shared.Model
-    directions: DirectionPrompt
-    regime: AnswerRegime
     source: Annotated[str, "dataset of the direction"]
     target: Annotated[str, "dataset that was steered"]
     layer: Block
@@ -77,11 +71,9 @@ STEERING_PECS = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProbeBaselineRow:
+class ProbeBaselineRow(Extracted):
     """A figure of the probing protocol on other features than states."""
 
-    model: shared.Model
-    prompt: Prompt
     features: Annotated[
         str,
         "question words, first frame, all frames, length, time stamps, output margin, noise as wide as states, or "
@@ -109,12 +101,10 @@ PROBE_BASELINES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateRow:
+class GateRow(Extracted):
     """A model's figures on a target before and after a gate: one regime, one kind of features, one source, one
     threshold."""
 
-    model: shared.Model
-    prompt: Prompt
     regime: Annotated[str, "system prompt of the answers that are gated"]
     features: Annotated[
         str, "states, or a control: a raw input, output margin, shuffled labels (of states) or untrained model"
@@ -150,11 +140,9 @@ GATE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskCoverageRow:
+class RiskCoverageRow(Extracted):
     """A point of the curve along which a gate gives up answers, from the riskiest on, over the four datasets."""
 
-    model: shared.Model
-    prompt: Prompt
     regime: Annotated[str, "system prompt of the answers"]
     features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
     coverage: Annotated[float, "share of items that are answered"]
@@ -171,11 +159,9 @@ RISK_COVERAGE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchingRow:
+class PatchingRow(Extracted):
     """The indirect effect of a group of positions at one site and layer, over the pairs of a dataset."""
 
-    model: shared.Model
-    prompt: Prompt
     dataset: shared.Dataset
     into: Annotated[str, "side whose pass is changed: control (towards its void) or void (towards its control)"]
     source: Annotated[

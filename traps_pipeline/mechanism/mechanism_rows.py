@@ -34,6 +34,41 @@ Percentile = Annotated[float | None, "95 % percentile interval"]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Extracted:
+    """Columns of what is made from one model's states under one prompt."""
+
+    model: shared.Model
+    prompt: Prompt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steered:
+    """Columns of figures of steered answers."""
+
+    model: shared.Model
+    directions: DirectionPrompt
+    regime: AnswerRegime
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeredCell:
+    """Columns of one answer at one dose of one direction."""
+
+    dataset: Target
+    model: shared.Model
+    directions: DirectionPrompt
+    regime: AnswerRegime
+    source: SteeredSource
+    kind: SteeredKind
+    draw: Draw
+    layer: SteeredLayer
+    unit: DoseUnit
+    dose: Dose
+    signs: Signs
+    alpha: Strength
+
+
+@dataclass(frozen=True, kw_only=True)
 class ProbeItemRow:
     """A clip and question for which hidden states are extracted."""
 
@@ -87,11 +122,9 @@ HIDDEN_STATES = Table("hidden_states", HiddenStatesRow, partition_by=("dataset",
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProbeRow:
+class ProbeRow(Extracted):
     """A figure of a probe of one dataset (source) on another (target) at one layer."""
 
-    model: shared.Model
-    prompt: Prompt
     analysis: Annotated[
         str,
         "transfer, held_out, confabulated, confabulated_held_out, within, shuffled, answerable_void, "
@@ -136,11 +169,9 @@ PROBES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class DirectionRow:
+class DirectionRow(Extracted):
     """A direction: one dataset at one layer."""
 
-    model: shared.Model
-    prompt: Prompt
     dataset: shared.Dataset
     kind: Kind
     draw: Draw
@@ -186,21 +217,9 @@ COSINES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringRow:
+class SteeringRow(SteeredCell):
     """One answer of a steered model; an answer at alpha 0 (the unsteered model) has one row for all directions."""
 
-    dataset: Target
-    model: shared.Model
-    directions: DirectionPrompt
-    regime: AnswerRegime
-    source: SteeredSource
-    kind: SteeredKind
-    draw: Draw
-    layer: SteeredLayer
-    unit: DoseUnit
-    dose: Dose
-    signs: Signs
-    alpha: Strength
     alpha_relative: AlphaRelative
     item_id: shared.ItemId
     scenario_id: shared.ScenarioId
@@ -229,21 +248,9 @@ STEERING = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringVoteRow:
+class SteeringVoteRow(SteeredCell):
     """One judge's vote on one steered answer."""
 
-    dataset: Target
-    model: shared.Model
-    directions: DirectionPrompt
-    regime: AnswerRegime
-    source: SteeredSource
-    kind: SteeredKind
-    draw: Draw
-    layer: SteeredLayer
-    unit: DoseUnit
-    dose: Dose
-    signs: Signs
-    alpha: Strength
     item_id: shared.ItemId
     side: shared.Side
     task: Annotated[str, "abstention, and correctness on controls"]
