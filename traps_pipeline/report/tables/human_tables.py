@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.protocol.metrics import METRIC_WORDS, SHARES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import DATASET, MODEL, REGIME, RUNS, ordered, titled
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, fraction, percent
@@ -13,8 +14,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 BY_PEOPLE = "nobody has labelled yet (run traps annotate)"
-_FIGURES = {"pecs": "PECS", "acc": "Acc %", "abs_rec": "AbsRec %", "false_abs": "FalseAbs %", "j": "J"}
-_PERCENT = ("acc", "abs_rec", "false_abs", "sensitivity", "specificity")
+_FIGURES = {name: metric.heading for name, metric in METRIC_WORDS.items()}
+_PERCENT = (*SHARES, "sensitivity", "specificity")
 
 
 def people(results: Results) -> list[PrintedTable]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.metrics import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
@@ -26,10 +27,10 @@ N, MISSING, RUNS = (
     Column("n_runs", "Runs", "count"),
 )
 EPOCH = Column("epoch", "Epoch")
-SHARES = (
-    Column("acc", "Acc %", "percent", spread="acc_std"),
-    Column("abs_rec", "AbsRec %", "percent", spread="abs_rec_std"),
-    Column("false_abs", "FalseAbs %", "percent", spread="false_abs_std"),
+SHARES = tuple(
+    Column(metric.name, metric.heading, "percent", spread=f"{metric.name}_std")
+    for metric in METRIC_WORDS.values()
+    if metric.is_share
 )
 J = Column("j", "J", "fraction", spread="j_std")
 PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark", look="strong")
