@@ -36,13 +36,15 @@ KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     """Requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
-    from traps_pipeline.base.partitions import DATASETS, REGIMES, Cell, Evaluation
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
     from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
+    from traps_pipeline.protocol.cells import Cell, Evaluation
+    from traps_pipeline.protocol.datasets import DATASETS
+    from traps_pipeline.protocol.regimes import REGIMES
     from traps_pipeline.storage.database import session_of
     from traps_pipeline.storage.segments import SegmentLedger
     from traps_pipeline.storage.shared_ledger import SharedLedger

@@ -48,13 +48,13 @@ def _clips(folder: Path) -> Iterator[Path]:
 def main() -> None:
     from tests.providers.server import Provider
     from traps_pipeline.base.digests import file_digest
-    from traps_pipeline.base.partitions import Cell, Evaluation
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
     from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
+    from traps_pipeline.protocol.cells import Cell, Evaluation
     from traps_pipeline.storage.media import MediaSpec, MediaStore
     from traps_pipeline.storage.segments import SegmentLedger
     from traps_pipeline.storage.study import Study

@@ -17,6 +17,7 @@ PACKAGE = Path(traps_pipeline.__file__).parent
 # of a file nor inside a function nor for types alone.
 ROOMS = (
     "base",
+    "protocol",
     "scenes",
     "storage",
     "benchmark",

@@ -11,9 +11,9 @@ import yaml
 
 from tests.build.errors import raises
 from traps_pipeline.base.names import LONGEST, check_name
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.cli import main
 from traps_pipeline.models import own
+from traps_pipeline.protocol.cells import Cell, Evaluation
 
 KEYS = ["", "a_b", "a__b", "A", "a|b", "a/b", "a b", "a,b", "a\n", "ä", "a\u0663"]
 PATHS = [".", "..", "a..b", "a...b", ".a", "a.", "-a", "a-", "a" * (LONGEST + 1)]

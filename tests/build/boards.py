@@ -7,11 +7,11 @@ from html.parser import HTMLParser
 
 import pandas as pd
 
-from traps_pipeline.base.partitions import SHORT
-from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text
+from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.terms import TITLES
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 
 NO_BREAK = "\u2011"  # a hyphen at which no line ends
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from traps_pipeline.release.harness.scoring import FIGURES
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 

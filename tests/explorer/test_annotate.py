@@ -16,7 +16,7 @@ from traps_pipeline.cli import main
 from traps_pipeline.explorer.annotate import Annotation, Sent
 from traps_pipeline.explorer.server import Listening
 from traps_pipeline.judging.confabulation import AXES
-from traps_pipeline.judging.tables import JUDGE_VALIDATION
+from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

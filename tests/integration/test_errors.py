@@ -14,7 +14,7 @@ from tests.build.records import edit_record
 from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
 from tests.lacking import lack
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.promise

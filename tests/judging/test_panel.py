@@ -11,10 +11,10 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.judging.panel import Vote, parse_vote, render, tasks_for, vote_request
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.prompts import prompt
+from traps_pipeline.protocol.cells import Cell, Evaluation
 
 ITEM: dict[str, Any] = {
     "item_id": "chaotic:seesaw_sorter-0001:control",

@@ -13,6 +13,8 @@ from tests.build.errors import raises
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
+from traps_pipeline.judging.human_label_rows import HUMAN_LABELS, LABELS_FILE, labels_version
+from traps_pipeline.judging.label_units import annotation_protocol, drawn_units, queue_of
 from traps_pipeline.judging.labels import (
     confabulation_rows,
     human_agreement,
@@ -20,8 +22,6 @@ from traps_pipeline.judging.labels import (
     matrix,
     truths,
 )
-from traps_pipeline.judging.people import annotation_protocol, drawn_units, queue_of
-from traps_pipeline.judging.people_tables import HUMAN_LABELS, LABELS_FILE, labels_version
 from traps_pipeline.storage.lines import checked_line
 
 PROTOCOL = annotation_protocol()

@@ -15,11 +15,10 @@ from statsmodels.stats.inter_rater import cohens_kappa
 from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
 from tests.judging.conftest import answered_study
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
 from traps_pipeline.judging.confabulation import AXES
-from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION
+from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.judging.validation import (
     HumanLabels,
     compare,
@@ -27,6 +26,7 @@ from traps_pipeline.judging.validation import (
     read_labels,
 )
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 
 
 def flags(text: str) -> np.ndarray:

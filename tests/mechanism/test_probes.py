@@ -11,8 +11,6 @@ from sklearn.preprocessing import StandardScaler
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, DATASETS, LONG, TIME_SWAPPED, transfer_type
-from traps_pipeline.mechanism.paths import STEERING_PATHS, TRANSFER_PAIRS
 from traps_pipeline.mechanism.probes import (
     Split,
     auroc,
@@ -26,6 +24,8 @@ from traps_pipeline.mechanism.probes import (
     within_split,
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS, TRANSFER_PAIRS
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, LONG, TIME_SWAPPED, transfer_type
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.scoring.published import published
 from traps_pipeline.storage.study import ProbeSettings

@@ -21,13 +21,20 @@ from tests.mechanism.steer_cell import CELL
 from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, DATASETS, Extraction, StatesCell, SteeringCell
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.baselines import baseline_rows
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.mechanism_rows import (
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING,
+    STEERING_VOTES,
+)
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
 from traps_pipeline.mechanism.shares import effect_rows, of_paper
 from traps_pipeline.mechanism.steering import (
@@ -38,12 +45,13 @@ from traps_pipeline.mechanism.steering import (
     strengths,
 )
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.tables import Table

@@ -16,7 +16,6 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import STOPS, Call, Settled, Work, run_work, settle
@@ -24,6 +23,7 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -334,7 +334,7 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 class Slow:

@@ -17,13 +17,13 @@ from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.ask import Call, Work, run_work
 from traps_pipeline.models.budget import Budget, BudgetReached, Journal
 from traps_pipeline.models.participants import OVERRUN, Participants, attempt
 from traps_pipeline.models.registry import Account, Entry
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 

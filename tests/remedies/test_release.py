@@ -19,7 +19,7 @@ from traps_pipeline.release.harness.write import write_harness
 from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.release.submission import pack, read_submission
 from traps_pipeline.release.verification import verify
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,6 @@ import pytest
 
 from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.remedies.remedied import refused
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs import judging, report, scoring
@@ -22,6 +21,7 @@ from traps_pipeline.explorer.answers import study_items
 from traps_pipeline.explorer.review import Review
 from traps_pipeline.models.answers import wanted_questions
 from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
 from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.worlds.clips import read_clip

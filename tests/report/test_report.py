@@ -12,17 +12,18 @@ import pytest
 
 from tests.build.boards import board_of, board_row, tables
 from tests.build.errors import raises
-from traps_pipeline.base.partitions import DATASETS, REGIMES, SHORT
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs, telling_times
-from traps_pipeline.report.figures.labels import Label, merged_labels
+from traps_pipeline.report.figures.label_placement import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
-from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
+from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.worked_example import chosen_example, example_figure, reading
 from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
 from traps_pipeline.scenes.picture.encode import encode
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
 
 HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"

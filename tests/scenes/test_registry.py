@@ -14,8 +14,8 @@ from tests.build.errors import raises
 from tests.build.families import PAGE, Add, add
 from tests.scenes.released import Released
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.benchmark.composition import load_composition
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes import family_registry as registry
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.resolve import Resolved

@@ -8,8 +8,16 @@ import pytest
 from tests.build.errors import raises
 from tests.scenes.released import load
 from tests.scenes.variation_table import written
-from traps_pipeline.base.partitions import FRAMINGS, LABEL_DOSES, PANEL_DOSES, SCHEMAS, VARIATIONS, beside_of, sides_of
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.protocol.datasets import (
+    FRAMINGS,
+    LABEL_DOSES,
+    PANEL_DOSES,
+    SCHEMAS,
+    VARIATIONS,
+    beside_of,
+    sides_of,
+)
 from traps_pipeline.scenes.observe import family_asking
 from traps_pipeline.scenes.parts.vision import largest
 from traps_pipeline.scenes.variants import variations

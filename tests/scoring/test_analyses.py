@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
     degenerate_strategies,

@@ -10,13 +10,13 @@ import pandas as pd
 import pytest
 
 from tests.build.verdicts import JUDGES, Rows, of_arm, write
-from traps_pipeline.base.partitions import ARMS, DATASETS
 from traps_pipeline.defs import judging, scoring
 from traps_pipeline.judging.ratings import VOTE_COLUMNS
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
-from traps_pipeline.scoring.tables import CONTRASTS
+from traps_pipeline.scoring.score_rows import CONTRASTS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

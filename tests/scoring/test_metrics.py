@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, cell_metrics, wrong_figures
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.parquet import TableStore
 
 

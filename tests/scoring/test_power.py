@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.cli import main
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.power import Shares, precision
 

@@ -13,11 +13,11 @@ import pytest
 from tests.build.errors import raises
 from tests.build.verdicts import of_arm, write
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs import scoring
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.robust import robust, wrong_rows
-from traps_pipeline.scoring.tables import ROBUST
+from traps_pipeline.scoring.score_rows import ROBUST
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

@@ -9,9 +9,10 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, REGIMES, datasets_of_category
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scoring.hypotheses import DATASETS_READ, RULES
+from traps_pipeline.protocol.datasets import DATASETS, datasets_of_category
+from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.scoring.doses import DATASETS_READ, RULES
 from traps_pipeline.storage.study import Study
 from traps_pipeline.study.experiment import load_experiment
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
@@ -12,8 +11,9 @@ from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.pieces import Files, Piece, make_pieces
 from traps_pipeline.orchestration.previews import Markdown
 from traps_pipeline.orchestration.stage import code_of, is_declared, of, source, stage
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.catalogue import FIGURES, TABLES, Report, workspace_files
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -132,7 +132,7 @@ def _gallery(workspace: Workspace) -> list[Piece]:
 
 def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.benchmark.shortcuts import shortcuts
-    from traps_pipeline.report.figures.shortcuts import shortcut_figure
+    from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
     from traps_pipeline.report.writing import figure_bytes
     from traps_pipeline.scenes.picture.encode import DamagedClip
 
@@ -149,7 +149,7 @@ def _shortcuts(workspace: Workspace) -> Files:
 
 
 def _page(workspace: Workspace) -> Files:
-    from traps_pipeline.report.items import FOLDER, write_item_pages
+    from traps_pipeline.report.cell_pages import FOLDER, write_item_pages
     from traps_pipeline.report.publish import report_files, study_pictures
 
     folder = workspace.reports / FOLDER

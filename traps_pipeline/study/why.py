@@ -7,12 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import REGIMES, Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
