@@ -1,5 +1,5 @@
 # What maintainers do: measurements, locks, releases, other libraries. Included by the Makefile, whose variables it uses.
-.PHONY: bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-vendor wheel sbom release-check environments
+.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-vendor wheel sbom release-check environments
 
 # Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
 test-newest: VENV := .workspaces/newest
@@ -13,6 +13,12 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check
 	$(PYTEST) -n auto $(FAST)
+
+# A number to look at, no threshold: what only slow tests reach counts as not reached.
+coverage: setup ## lines and branches of the package that the fast tests reach, by room and in all
+	$(PIP_INSTALL) coverage==7.17.4
+	OMP_NUM_THREADS=1 $(BIN)/python -m coverage run --branch --source traps_pipeline -m pytest -m "not slow and not promise" --ignore=tests/integration
+	$(BIN)/python -m coverage report --skip-covered
 
 # Of these the campaign has a small version (tests/integration/test_cluster.py).
 test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs

@@ -36,7 +36,6 @@ KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     """Requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
-    from traps_pipeline.base.partitions import DATASETS, REGIMES, Cell, Evaluation
     from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.ledger.postgres import postgres_of
     from traps_pipeline.ledger.sqlite import SqliteDatabase
@@ -46,6 +45,9 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
+    from traps_pipeline.protocol.cells import Cell, Evaluation
+    from traps_pipeline.protocol.datasets import DATASETS
+    from traps_pipeline.protocol.regimes import REGIMES
     from traps_pipeline.storage.study import Study
 
     account = Account(key=KEY, base_url=f"{url}/v1")

@@ -35,6 +35,7 @@ from tests.providers.server import Provider
 from traps_pipeline.cli.command import OVER_BUDGET
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.objects import ObjectStore
+from traps_pipeline.ledger.money import Money
 
 MODELS, CONNECTIONS = ("seer-a", "seer-b"), 2
 BUDGET_USD = 6.0  # two dead blocks of 16 worst cases are $2.84

@@ -23,7 +23,7 @@ import pandas as pd
 from scipy.stats import norm
 
 from bench.quick import parse
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     TAXONOMIES,

@@ -27,8 +27,8 @@ STAGES = {"responses": CELL, "votes": CELL, "verdicts": CELL, "metrics": "chaoti
 PAGE = """
 import os, sys
 from pathlib import Path
-from traps_pipeline.base.partitions import Cell
-from traps_pipeline.report.items import item_pages
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.report.cell_pages import item_pages
 from traps_pipeline.storage.workspace import Workspace
 workspace = Workspace.open(Path(os.environ["TRAPS_WORKSPACE"]))
 sizes = [len(page) for page in item_pages(workspace, Cell.parse(sys.argv[1]), None)]

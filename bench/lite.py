@@ -18,9 +18,9 @@ from scipy.stats import kendalltau
 
 from bench.quick import parse
 from traps_pipeline.base.digests import digest
-from traps_pipeline.base.partitions import DATASETS, datasets_of_category, taxonomy_of
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.protocol.datasets import DATASETS, datasets_of_category, taxonomy_of
 from traps_pipeline.scoring.published import published_cells
 
 FULL, RUNS = {"occlusion": 202, "chaotic": 500}, 3

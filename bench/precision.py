@@ -15,16 +15,17 @@ from pathlib import Path
 import pandas as pd
 
 from bench.quick import parse
-from traps_pipeline.base.partitions import DATASETS, REGIMES, SIDES, datasets_of_category
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.reference import STRATEGIES
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.datasets import DATASETS, SIDES, datasets_of_category
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.power import Shares, precision
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import LITE_FILE, load_experiment
 

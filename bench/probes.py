@@ -20,10 +20,10 @@ from sklearn.preprocessing import StandardScaler
 from threadpoolctl import threadpool_limits
 
 from bench.quick import parse
-from traps_pipeline.base.partitions import DATASETS
-from traps_pipeline.mechanism.paths import TRANSFER_PAIRS
 from traps_pipeline.mechanism.probes import Split, auroc, fit_probe, transfer_scores
 from traps_pipeline.mechanism.probing import each_layer
+from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS
+from traps_pipeline.protocol.datasets import DATASETS
 
 PAIRS = {"occlusion": 202, "occlusion_ill_posed": 202, "chaotic": 500, "chaotic_ill_posed": 500}
 WIDTH, SHARED = 4096, 400

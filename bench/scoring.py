@@ -17,12 +17,13 @@ import numpy as np
 import pandas as pd
 
 from bench.quick import parse
-from traps_pipeline.base.partitions import DATASETS, REGIMES, taxonomy_of
 from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
-from traps_pipeline.scoring.leaderboard import leaderboard
 from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.scoring.standings import leaderboard
 
 SCENARIOS = {"occlusion": 202, "chaotic": 500}
 JUDGES = ("judge-a", "judge-b", "judge-c")

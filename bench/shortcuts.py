@@ -42,7 +42,7 @@ from traps_pipeline.scenes.picture.checks import control_frames
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.worlds.world import World
-from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
+from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 
 STEP = 2  # every second frame is shown: 5 of 10 a second

@@ -48,7 +48,6 @@ def _clips(folder: Path) -> Iterator[Path]:
 def main() -> None:
     from tests.providers.server import Provider
     from traps_pipeline.base.digests import file_digest
-    from traps_pipeline.base.partitions import Cell, Evaluation
     from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.ledger.sqlite import SqliteDatabase
     from traps_pipeline.models.api import ApiBackend, load_litellm
@@ -57,6 +56,7 @@ def main() -> None:
     from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
+    from traps_pipeline.protocol.cells import Cell, Evaluation
     from traps_pipeline.storage.media import MediaSpec, MediaStore
     from traps_pipeline.storage.study import Study
 

@@ -32,6 +32,7 @@ pytest_plugins = ["tests.tiers"]
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = "tests/experiments/small.yaml"  # of the small study, relative to a checkout
 SMALL = ROOT / EXPERIMENT
+CLIP_CACHE = os.environ.get("TRAPS_CLIP_CACHE", "")  # of the user, for studies that are made once a run
 KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"  # of the test provider
 
 
@@ -156,7 +157,11 @@ def copy_workspace(source: Path, target: Path) -> None:
 
 
 def pytest_sessionstart() -> None:
-    """What tests start is stopped by signals, also where this run was itself started in the background."""
+    """What tests start is stopped by signals, also where this run was itself started in the background.
+
+    Tests count what they render: only studies that are made once a run take clips from the cache of this machine.
+    """
+    os.environ["TRAPS_CLIP_CACHE"] = "off"
     for stop in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(stop) is signal.SIG_IGN:
             signal.signal(stop, signal.default_int_handler if stop is signal.SIGINT else signal.SIG_DFL)
@@ -209,7 +214,9 @@ def run_once(
     def make(workspace: Path) -> str:
         if clips:
             shutil.copytree(clips, workspace / "clips")
-        finished = Checkout(ROOT, workspace).traps("run", experiment, *more)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("TRAPS_CLIP_CACHE", CLIP_CACHE)
+            finished = Checkout(ROOT, workspace).traps("run", experiment, *more)
         assert finished.code == 0, finished.out + finished.err
         return finished.out
 

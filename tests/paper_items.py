@@ -11,13 +11,10 @@ DATA, PAGE = ROOT / "docs" / "paper.csv", ROOT / "docs" / "paper.md"
 STATUSES = ("there", "departs", "missing")
 HEAD = """# The paper, item by item
 
-Every item of the paper that this project was compared with: where it stands in the paper (line of its LaTeX source),
-where it stands here, which test walks it, and its status. `docs/paper.csv` is the data, `python -m tests.paper_items`
-writes this page, and `tests/test_paper_items.py` fails where a named file or test does not exist or the page is not
-what the data give.
+For readers of the paper. After this page you know what is implemented, where, and what differs.
 
-**there**: as the paper has it. **departs**: otherwise, for the reason in the note, which also says where a reader is
-told. **missing**: not built.
+`docs/paper.csv` is the data: each item also has its line in the paper's LaTeX source and the test that walks it.
+`python -m tests.paper_items` writes this page. A test fails where a named file or test does not exist.
 
 """
 
@@ -29,17 +26,20 @@ def items() -> list[dict[str, str]]:
 
 
 def page() -> str:
-    """The page."""
+    """Return the page: departures with their reasons first, then what is missing, then what is as in the paper."""
     rows = items()
     counts = Counter(row["status"] for row in rows)
-    lines = ["| # | item | line | here | test | status | note |", "| ---: | --- | ---: | --- | --- | --- | --- |"]
-    for row in rows:
-        place = f"`{row['place']}`" if row["place"] else ""
-        test = f"`{row['test'].removeprefix('tests/').replace('::test_', ': ')}`" if row["test"] else ""
-        cells = [row["n"], row["item"], row["line"], place, test, row["status"], row["note"]]
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    total = ", ".join(f"{counts[status]} {status}" for status in STATUSES)
-    return f"{HEAD}{len(rows)} items: {total}.\n\n" + "\n".join(lines) + "\n"
+    parts = [f"{HEAD}{len(rows)} items: {', '.join(f'{counts[status]} {status}' for status in STATUSES)}.\n"]
+    for status, title in (("departs", "Departures"), ("missing", "Missing"), ("there", "As in the paper")):
+        listed = [_line(row) for row in rows if row["status"] == status]
+        parts += [f"\n## {title}\n\n", *listed] if listed else []
+    return "".join(parts)
+
+
+def _line(row: dict[str, str]) -> str:
+    place = f" (`{row['place']}`)" if row["place"] else ""
+    note = f": {row['note']}" if row["note"] else ""
+    return f"- **{row['n']}** {row['item']}{place}{note}\n"
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import pytest
 
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.conftest import ROOT
-from tests.test_readme import ELSEWHERE
 from traps_pipeline.cli import build_parser
 from traps_pipeline.definitions import defs
 from traps_pipeline.orchestration.graph import the_graph
@@ -47,6 +46,7 @@ RUN_AS = {
     },
 }
 # `.ci/run` is `make test`, which sets up in a fresh environment and runs what `make check` runs.
+ELSEWHERE = ("make test", "make ui")  # lines of the README that tests/test_readme.py does not run
 IN_CI = ("venv", "make check", "make setup", "make test", "make help")
 
 

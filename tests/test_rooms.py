@@ -17,6 +17,7 @@ PACKAGE = Path(traps_pipeline.__file__).parent
 # of a file nor inside a function nor for types alone.
 ROOMS = (
     "base",
+    "protocol",
     "scenes",
     "ledger",
     "storage",
@@ -83,9 +84,9 @@ def test_every_room_has_its_place_and_every_place_a_room() -> None:
     assert len({*ROOMS}) == len(ROOMS)
 
 
-def test_the_readme_lists_the_rooms_from_top_to_bottom() -> None:
-    readme = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
-    section = readme.partition("## Where things are\n")[2].partition("\n## ")[0]
+def test_contributing_lists_the_rooms_from_top_to_bottom() -> None:
+    page = (PACKAGE.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = page.partition("## Where things are\n")[2].partition("\n## ")[0]
     lines = section.partition("```text\n")[2].partition("```")[0].splitlines()
     listed = [name.removesuffix(".py").rstrip("/") for line in lines for name in line.split("  ")[0].split(", ")]
     assert listed == [*reversed(ROOMS)]

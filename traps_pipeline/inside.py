@@ -22,8 +22,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation, Extraction
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.contrast import ccs as ccs
 from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.deciding import Gate, Threshold, fitted_gate
@@ -37,6 +36,8 @@ from traps_pipeline.mechanism.sites import Site, changing, check_head, head_slic
 from traps_pipeline.mechanism.stages import saved_directions
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import get_model
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from torch.nn import Module
 
 Where = str | Path | Workspace
-REGIMES = ("standard", "guided", "json")
 
 
 def _workspace(where: Where) -> Workspace:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing, write_bytes, write_text
@@ -84,7 +85,7 @@ def test_a_durable_file_that_does_not_reach_the_disk_does_not_take_the_place(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "fsync", broken)
-    with pytest.raises(TrapsError, match=r"table\.bin: cannot be written \(Input/output error\)"):
+    with raises(TrapsError, "base.files.replacing", "table.bin"):
         write_bytes(file, b"next", durable=True)
     assert file.read_text() == "former"
     assert alone(file)
@@ -100,7 +101,7 @@ def test_many_threads_that_write_one_file_leave_one_of_their_contents_whole(file
 
 def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
     write_text(tmp_path / "results", "a file")
-    with pytest.raises(TrapsError, match=r"results/table\.csv: cannot be written"):
+    with raises(TrapsError, "base.files.replacing", "results/table.csv"):
         write_text(tmp_path / "results" / "table.csv", "content")
     assert (tmp_path / "results").read_text() == "a file"
 

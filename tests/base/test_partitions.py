@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.base.partitions import (
+from tests.build.errors import raises
+from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, SteeringCell
+from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
     BESIDE,
     CATEGORIES,
@@ -12,15 +15,11 @@ from traps_pipeline.base.partitions import (
     DATASETS,
     EXTENSION_CATEGORIES,
     OCCLUSION_CATEGORIES,
-    Cell,
-    Evaluation,
-    SteeringCell,
     datasets_of_category,
     is_ill_posed,
     taxonomy_of,
     transfer_type,
 )
-from traps_pipeline.orchestration.wanted import Wanted
 
 
 def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:
@@ -35,7 +34,7 @@ def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None
 def test_steering_keys_of_a_study_with_arms_are_read_though_no_arm_is_steered() -> None:
     cells = [SteeringCell.make(dataset, "pocket", "standard", "guided") for dataset in (*DATASETS, *BESIDE)]
     assert all(SteeringCell.parse(cell.key) == cell for cell in cells)
-    with pytest.raises(ValueError, match="is not dataset"):
+    with raises(ValueError, "protocol.cells.SteeringCell.parse"):
         SteeringCell.parse("pachinko|pocket__standard__guided")
 
 
@@ -55,13 +54,13 @@ def test_a_cell_reads_as_the_design_says() -> None:
     ],
 )
 def test_a_wrong_evaluation_key_is_refused(key: str) -> None:
-    with pytest.raises(ValueError, match=r"evaluation key|must match"):
+    with raises(ValueError, "protocol"):
         Evaluation.parse(key)
 
 
 @pytest.mark.parametrize("key", ["pachinko|m__guided__run1", "m__guided__run1", "occlusion", "|m__guided__run1", ""])
 def test_a_wrong_cell_key_is_refused(key: str) -> None:
-    with pytest.raises(ValueError, match=r"cell key|evaluation key"):
+    with raises(ValueError, "protocol.cells"):
         Cell.parse(key)
 
 

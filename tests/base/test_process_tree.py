@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.processes import MARK, marked, wait_until_gone
 from traps_pipeline.base.process_tree import split
 
-MARK = "TRAPS_TEST_TREE"
 END_S = 60  # more than nine times what it takes
 # A command of two processes. Below the second one: a program that ends at SIGTERM, which has started one in a session
 # of its own that ignores it. The last to start writes the second process's id.
@@ -41,25 +41,6 @@ with _stopped_alike():
     finally:
         stop_descendants(0.5)
 '''
-
-
-def marked(mark: str) -> set[int]:
-    """Processes that run with this mark in their environment, zombies left out."""
-    pids = set[int]()
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
-                pids.add(int(folder.name))
-        except OSError:
-            continue
-    return pids
-
-
-def wait_until_gone(mark: str, seconds: float) -> None:
-    until = time.monotonic() + seconds
-    while pids := marked(mark):
-        assert time.monotonic() < until, f"still there after {seconds} s: {pids}"
-        time.sleep(0.05)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_lines, read_yaml
@@ -32,39 +33,39 @@ def test_what_is_shipped_reads_as_any_reader_reads_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    "text",
     [
-        ("a: 1\nb: 2\na: 3", "line 3: 'a' stands there twice"),
-        ("a: {b: 1, b: 2}", "'b' stands there twice"),
-        ("a: &x [1]\nb: &y [*x, *x]", "one inside an anchor"),
-        ("a: &x [1]\nb: [" + "*x, " * 300 + "]", "too many aliases"),
-        ("a: !!python/object/apply:os.system [ls]", "line 1: remove the tag !!python/object/apply:os.system"),
-        ("a: !!timestamp 2026-11-21", "remove the tag !!timestamp: no value has one"),
-        ("a: !!binary aGk=", "remove the tag !!binary"),
-        ("a: !!float .inf", "remove the tag !!float"),
-        ("b: 1\na: !!bool abc", "line 2: remove the tag !!bool"),
-        ("a: !!int x", "remove the tag !!int"),
-        ("a: !!str 5", "remove the tag !!str"),
-        ("!!int a: 5", "remove the tag !!int"),
-        ("a: !!null x", "remove the tag !!null"),
-        ("a: !!seq {b: 1}", "remove the tag !!seq"),
-        ("a: !!map [1]", "remove the tag !!map"),
-        ("a: !!set {b}", "remove the tag !!set"),
-        ("a: !!merge x", "remove the tag !!merge"),
-        ("a: !own {b: 1}", "remove the tag !own"),
-        ("a: ! 5", "remove the tag !:"),
-        ("%TAG !e! tag:yaml.org,2002:\n---\na: !e!bool abc", "remove the tag !!bool"),
-        ("a: !<tag:evil.example,2026:x> 1", "remove the tag tag:evil.example,2026:x"),
-        ("a: 1e999", "is no finite number"),
-        ("? [1, 2]\n: 3", "a key is a word or a number"),
-        ("[" * 100, "nested too deeply"),
-        ('a: "\\ud800"', "surrogates not allowed|invalid Unicode character"),
-        ("a: \x00", "unacceptable character"),
+        "a: 1\nb: 2\na: 3",
+        "a: {b: 1, b: 2}",
+        "a: &x [1]\nb: &y [*x, *x]",
+        "a: &x [1]\nb: [" + "*x, " * 300 + "]",
+        "a: !!python/object/apply:os.system [ls]",
+        "a: !!timestamp 2026-11-21",
+        "a: !!binary aGk=",
+        "a: !!float .inf",
+        "b: 1\na: !!bool abc",
+        "a: !!int x",
+        "a: !!str 5",
+        "!!int a: 5",
+        "a: !!null x",
+        "a: !!seq {b: 1}",
+        "a: !!map [1]",
+        "a: !!set {b}",
+        "a: !!merge x",
+        "a: !own {b: 1}",
+        "a: ! 5",
+        "%TAG !e! tag:yaml.org,2002:\n---\na: !e!bool abc",
+        "a: !<tag:evil.example,2026:x> 1",
+        "a: 1e999",
+        "? [1, 2]\n: 3",
+        "[" * 100,
+        'a: "\\ud800"',
+        "a: \x00",
     ],
 )
-def test_what_two_readers_could_take_for_two_things_is_refused(file: Path, text: str, complaint: str) -> None:
+def test_what_two_readers_could_take_for_two_things_is_refused(file: Path, text: str) -> None:
     file.write_text(text)
-    with pytest.raises(TrapsError, match=rf"file\.yaml: not valid YAML \(.*({complaint})"):
+    with raises(TrapsError, "base.yamlfile.read_yaml", "file.yaml"):
         read_yaml(file)
 
 
@@ -80,35 +81,35 @@ def test_words_that_early_yaml_takes_for_something_else_are_words(file: Path) ->
 @pytest.mark.parametrize("said", ["yes", "true", "1:30", ".inf", ".nan", "010", '"20"', "2_0", "1e999", "-1", "[20]"])
 def test_a_budget_is_a_number_and_nothing_that_looks_like_one(tmp_path: Path, said: str) -> None:
     (tmp_path / "study.yaml").write_text(f"format: 1\nbudget_usd: {said}\n")
-    with pytest.raises(TrapsError, match=r"study\.yaml: .*"):
+    with raises(TrapsError, "base.yamlfile", "study.yaml"):
         Workspace.open(tmp_path)
 
 
 def test_a_word_is_no_truth_and_a_number_neither(file: Path) -> None:
     for said in ("yes", "1", '"true"'):
         file.write_text(f"allow_unknown_prices: {said}")
-        with pytest.raises(TrapsError, match=r"allow_unknown_prices: .* is no true or false"):
+        with raises(TrapsError, "base.yamlfile.parse_yaml_model"):
             parse_yaml_model(Study, read_yaml(file), file)
 
 
 @pytest.mark.parametrize(
-    ("line", "complaint"),
+    "line",
     [
-        ('{"a": 1, "a": 2}', "'a' stands there twice"),
-        ('{"b": [{"a": 1, "a": 2}]}', "'a' stands there twice"),
-        ('{"a": NaN}', "NaN is no finite number"),
-        ('{"a": -Infinity}', "no finite number"),
-        ('{"a": 1e999}', "no finite number"),
-        ('{"a": "\\ud83d"}', "half of a surrogate pair"),
-        ('{"a": ' + "9" * 5000 + "}", "thousands of digits"),
-        ("[" * 5000, "nested too deeply"),
+        '{"a": 1, "a": 2}',
+        '{"b": [{"a": 1, "a": 2}]}',
+        '{"a": NaN}',
+        '{"a": -Infinity}',
+        '{"a": 1e999}',
+        '{"a": "\\ud83d"}',
+        '{"a": ' + "9" * 5000 + "}",
+        "[" * 5000,
     ],
 )
-def test_an_ambiguous_line_is_named(file: Path, line: str, complaint: str) -> None:
+def test_an_ambiguous_line_is_named(file: Path, line: str) -> None:
     file.write_text(f'{{"a": "\\ud83d\\ude00 [[[["}}\n{line}\n')
     lines = read_lines(file)
     assert next(lines)[0] == 1
-    with pytest.raises(TrapsError, match=rf"file\.yaml:2: .*{complaint}") as raised:
+    with raises(TrapsError, "base.yamlfile._check_line", "file.yaml:2") as raised:
         next(lines)
     assert len(str(raised.value)) < 400 + len(str(file))
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Scenario, categories_of, fold, read_corrections, subset
 from traps_pipeline.benchmark.records import load_released
@@ -106,49 +107,46 @@ DISCARD = {"scenario_id": ID, "action": "discard"}
 
 
 @pytest.mark.parametrize(
-    ("lines", "place", "complaint"),
+    ("lines", "place"),
     [
-        ([correct(scenario_id="domino_chain-7777", question="Q?")], 1, "scenario 'domino_chain-7777' is unknown"),
-        ([correct(answer="sideways")], 1, rf"{ID}: ground_truth 'sideways' is not one of the labels"),
-        ([correct(labels=["a", "b"])], 1, rf"{ID}: ground_truth .* is not one of the labels \['a', 'b'\]"),
-        ([correct(aliases={"maybe": "perhaps"})], 1, r"aliases point to unknown labels \['perhaps'\]"),
-        ([DISCARD, DISCARD], 2, rf"scenario '{ID}' was discarded"),
-        ([DISCARD, correct(question="Q?")], 2, rf"scenario '{ID}' was discarded"),
-        ([ADD | {"scenario_id": ID}], 1, rf"cannot add '{ID}': the id is taken"),
-        ([DISCARD, ADD | {"scenario_id": ID}], 2, rf"cannot add '{ID}': the id is taken"),
-        ([ADD, ADD], 2, "cannot add 'domino_chain-9001': the id is taken"),
-        ([ADD | {"family": "trebuchet"}], 1, "a known family, not 'trebuchet'; known: .*domino_chain"),
-        ([{k: v for k, v in ADD.items() if k != "params"}], 1, "`add` needs params"),
-        ([ADD | {"params": {"mass_kg": 3}}], 1, "mass_kg"),
+        ([correct(scenario_id="domino_chain-7777", question="Q?")], 1),
+        ([correct(answer="sideways")], 1),
+        ([correct(labels=["a", "b"])], 1),
+        ([correct(aliases={"maybe": "perhaps"})], 1),
+        ([DISCARD, DISCARD], 2),
+        ([DISCARD, correct(question="Q?")], 2),
+        ([ADD | {"scenario_id": ID}], 1),
+        ([DISCARD, ADD | {"scenario_id": ID}], 2),
+        ([ADD, ADD], 2),
+        ([ADD | {"family": "trebuchet"}], 1),
+        ([{k: v for k, v in ADD.items() if k != "params"}], 1),
+        ([ADD | {"params": {"mass_kg": 3}}], 1),
         (
             [correct(params={"mass_kg": 3})],
             1,
-            r"family domino_chain has no parameters \['mass_kg'\]; it has .*height_m",
         ),
-        ([correct()], 1, "`correct` gives no change"),
+        ([correct()], 1),
         (
             [{"scenario_id": ID, "action": "keep", "question": "Q?"}],
             1,
-            r"`keep` changes nothing, yet gives \['question'\]",
         ),
-        ([DISCARD | {"answer": "yes"}], 1, r"`discard` changes nothing, yet gives \['answer'\]"),
-        ([correct(question="Q?", who="")], 1, "who: "),
-        ([correct(question="Q?", when="yesterday")], 1, "when: "),
-        ([correct(question="Q?", why="")], 1, "why: "),
-        ([correct(qestion="Q?")], 1, "qestion: "),
-        ([{"scenario_id": ID, "action": "improve"}], 1, "action: "),
-        (["{not json"], 1, "not JSON"),
+        ([DISCARD | {"answer": "yes"}], 1),
+        ([correct(question="Q?", who="")], 1),
+        ([correct(question="Q?", when="yesterday")], 1),
+        ([correct(question="Q?", why="")], 1),
+        ([correct(qestion="Q?")], 1),
+        ([{"scenario_id": ID, "action": "improve"}], 1),
+        (["{not json"], 1),
         (
             [correct(question="Q?"), "", '{"scenario_id": "a-1", "action": "keep"}'],
             3,
-            "who: Field required; .*why: Field",
         ),
     ],
 )
 def test_a_wrong_decision_names_its_file_and_line(
-    tmp_path: Path, lines: list[dict[str, Any] | str], place: int, complaint: str
+    tmp_path: Path, lines: list[dict[str, Any] | str], place: int
 ) -> None:
-    with pytest.raises(TrapsError, match=rf"review\.jsonl:{place}: .*{complaint}"):
+    with raises(TrapsError, "benchmark.corrections", f"review.jsonl:{place}"):
         decide(tmp_path, *lines)
 
 
@@ -164,7 +162,7 @@ def test_a_study_takes_all_the_first_of_each_family_or_named_scenarios() -> None
 def test_a_discarded_scenario_falls_out_of_a_study_that_names_it_and_an_unknown_one_is_an_error(tmp_path: Path) -> None:
     scenarios = decide(tmp_path, DISCARD)
     assert list(subset(scenarios, Study(scenarios=[ID, "hidden_race-0002"]))) == ["hidden_race-0002"]
-    with pytest.raises(TrapsError, match=r"study\.yaml: unknown scenarios \['domino_chain-7777'\]"):
+    with raises(TrapsError, "benchmark.corrections.subset", "['domino_chain-7777']"):
         subset(scenarios, Study(scenarios=["domino_chain-7777"]))
 
 

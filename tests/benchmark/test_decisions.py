@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Correction, fold, read_corrections
 from traps_pipeline.benchmark.decisions import FILE, DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
@@ -42,7 +43,7 @@ def test_a_decision_is_one_line_in_the_format_of_corrections(tmp_path: Path) -> 
 
 
 def test_a_decision_that_does_not_fit_is_not_written(tmp_path: Path) -> None:
-    with pytest.raises(TrapsError, match="purple"):
+    with raises(TrapsError, "benchmark.corrections.apply_words", "purple"):
         decide(decision("correct", answer="purple"), seen=0, folder=tmp_path)
     assert (tmp_path / FILE).read_text() == ""
 
@@ -79,23 +80,23 @@ def test_an_added_scenario_is_taken_back_by_discarding_it(tmp_path: Path) -> Non
     assert "domino_chain-9001" in benchmark(tmp_path)
     undo("domino_chain-9001", 1, who="jd", why="not needed", folder=tmp_path)
     assert "domino_chain-9001" not in benchmark(tmp_path)
-    with pytest.raises(TrapsError, match="was never released; `discard` takes back"):
+    with raises(TrapsError, "benchmark.corrections._restored"):
         decide(decision("restore", "domino_chain-9001"), seen=2, folder=tmp_path)
 
 
 def test_who_decides_on_what_somebody_else_decided_is_told(tmp_path: Path) -> None:
     decide(decision("discard"), seen=0, folder=tmp_path)
-    with pytest.raises(DecidedMeanwhile, match="jd decided meanwhile"):
+    with raises(DecidedMeanwhile, "benchmark.decisions._require_known"):
         decide(decision("keep"), seen=0, folder=tmp_path)
     with pytest.raises(DecidedMeanwhile):
         undo(ID, 0, who="ab", why="no", folder=tmp_path)
-    with pytest.raises(TrapsError, match="no decision stands"):
+    with raises(TrapsError, "benchmark.decisions.undo"):
         undo(OTHER, 0, who="ab", why="no", folder=tmp_path)
 
 
 def test_a_file_that_would_overrule_reviews_is_named(tmp_path: Path) -> None:
     (tmp_path / "zz.jsonl").write_text("")
-    with pytest.raises(TrapsError, match=r"zz\.jsonl: is read after review\.jsonl"):
+    with raises(TrapsError, "benchmark.decisions._appending", "zz.jsonl", "review.jsonl"):
         decide(decision("keep"), seen=0, folder=tmp_path)
 
 

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.judging.test_validation import MODEL, labelled_study
+from tests.build.errors import raises
+from tests.build.labels import MODEL, labelled_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import personal_tokens, public_name
 from traps_pipeline.cli import main
 from traps_pipeline.explorer.annotate import Annotation, Sent
 from traps_pipeline.explorer.server import Listening
 from traps_pipeline.judging.confabulation import AXES
-from traps_pipeline.judging.tables import JUDGE_VALIDATION
+from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -51,7 +52,7 @@ def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
 
 
 def test_a_study_without_clips_or_answers_says_so(tmp_path: Path) -> None:
-    with pytest.raises(TrapsError, match="has no clips yet; run `traps run EXPERIMENT`"):
+    with raises(TrapsError, "explorer.annotate.Annotation.__init__"):
         Annotation(Workspace.create(tmp_path / "study", Study(name="empty", panel="rules")))
 
 
@@ -66,5 +67,5 @@ def test_each_person_has_an_address_of_their_own_that_stays(tmp_path: Path) -> N
     }
     assert public_name("https://labels.example.org:8443") == "labels.example.org:8443"
     for wrong in ("labels.example.org", "http://labels.example.org", "https://labels.example.org/path", "https://"):
-        with pytest.raises(TrapsError, match="give the address of the server with HTTPS"):
+        with raises(TrapsError, "base.webguard.public_name"):
             public_name(wrong)

@@ -14,9 +14,9 @@ import pytest
 
 from tests.conftest import KEY, SECRET, SMALL, Checkout, copy_of, forget_answers
 from tests.providers.server import Provider
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.tables import Table
 
 pytestmark = pytest.mark.slow

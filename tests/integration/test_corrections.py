@@ -14,8 +14,9 @@ from tests.conftest import EXPERIMENT, Checkout
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -59,6 +60,15 @@ key = dg.AssetCheckKey(dg.AssetKey(sys.argv[1]), sys.argv[2])
 with dg.DagsterInstance.get() as history:
     record = history.event_log_storage.get_latest_asset_check_execution_by_key([key])[key]
     print(record.status.value, record.event.dagster_event.asset_check_evaluation_data.partition)
+"""
+
+# One tick of the sensor that is on by default.
+TICK = """
+import dagster as dg
+from traps_pipeline.definitions import defs
+sensor = defs.get_repository_def().get_sensor_def("follow_corrections")
+with dg.DagsterInstance.get() as history, dg.build_sensor_context(history, definitions=defs) as context:
+    print(len(sensor.evaluate_tick(context).run_requests))
 """
 
 
@@ -139,6 +149,17 @@ def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study
     run = study.score(EXPERIMENT)
     assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": 15 * EVALUATIONS, "frames": 0}
     assert stale_in_dagster(study) == []
+
+
+def test_a_deleted_table_fails_its_check_within_a_tick_of_the_sensor(study: Checkout) -> None:
+    assert study.python("-c", TICK).out.split() == ["0"]
+    tables = Workspace.open(study.workspace).tables
+    cell = {"dataset": "chaotic", "model": "prior", "regime": "json", "run": 1}
+    tables.path(VERDICTS, cell).unlink()
+    finished = study.python("-c", TICK)
+    assert finished.out.split() == ["0"], finished.err  # nothing that is merely missing is made
+    latest = study.python("-c", LATEST, "verdicts", "current")
+    assert latest.out.split() == ["FAILED", "chaotic|prior__json__run1"], latest.err
 
 
 def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Checkout) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sqlite3
 import subprocess
@@ -13,10 +12,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.build.records import edit_record
 from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
 from tests.lacking import lack
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -27,14 +27,6 @@ def assert_refused(finished: Finished, *words: str) -> None:
     assert "Traceback" not in finished.err, finished.err
     for word in words:
         assert word in finished.err, finished.err
-
-
-def edit_record(study: Checkout, file: str, line: int, **changes: object) -> Path:
-    path = study.root / "scene_specs" / "released" / f"{file}.jsonl"
-    lines = path.read_text().splitlines()
-    lines[line - 1] = json.dumps(json.loads(lines[line - 1]) | changes)
-    path.write_text("\n".join(lines) + "\n")
-    return path
 
 
 def test_a_malformed_spec_names_file_and_line(own_study: Checkout) -> None:

@@ -9,18 +9,16 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.promise
 ANSWERS = 3 * 2 * 48  # models x regimes x items of 12 scenarios in two datasets, two sides
 VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void's one
-FRAMES = 6 * 150 + 6 * 100  # control, void and twin; the void of a chaotic scenario is the beginning of its control
 
 
 def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
-    told = f"{ANSWERS} answers asked (0 from the ledger), {VOTES} votes asked (0 from the ledger), {FRAMES} frames"
-    assert told in small_output
+    assert f"{ANSWERS} answers asked (0 from the ledger), {VOTES} votes asked (0 from the ledger)" in small_output
     for name in ("report.html", "gallery.html", "figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png"):
         path = small.workspace / "reports" / name
         assert str(path) in small_output.splitlines()

@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import KEY, ROOT, SMALL, Checkout
 from tests.providers.server import Provider
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.records import edit_record
 from tests.build.studies import assert_same_tables
 from tests.conftest import EXPERIMENT, Checkout, Finished
-from tests.integration.test_errors import edit_record
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, sync_playwright
 from tests.build.cells import CELL, HOSTILE, write_cell
 from tests.conftest import Checkout
 from tests.pages import patient
-from traps_pipeline.report.items import item_pages
+from traps_pipeline.report.cell_pages import item_pages
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

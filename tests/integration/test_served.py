@@ -9,7 +9,7 @@ import pytest
 from tests.conftest import ROOT, SMALL, Checkout
 from tests.providers.server import Provider
 from tests.serving import transformers_serve
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -13,12 +13,12 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging import panel
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -118,7 +118,7 @@ def test_one_command_makes_all_that_the_study_asks_and_fails_with_what_it_could_
 
 
 def _partition(cell: str) -> dict[str, str | int]:
-    from traps_pipeline.base.partitions import Cell
+    from traps_pipeline.protocol.cells import Cell
 
     return Cell.parse(cell).partition
 

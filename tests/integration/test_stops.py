@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.base.test_process_tree import MARK, marked, wait_until_gone
+from tests.build.processes import MARK, marked, wait_until_gone
 from tests.conftest import ROOT, Checkout
 
 pytestmark = pytest.mark.slow

@@ -22,8 +22,8 @@ from traps_pipeline.judging.agreement import (
     krippendorff_alpha,
     unanimous_share,
 )
+from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.judging.ratings import INVALID, NO, YES, majority, ratings
-from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.storage.parquet import TableStore
 
 VALUES = {"y": YES, "n": NO, "-": INVALID}

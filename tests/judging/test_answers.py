@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.judging.answers import is_correct, normalise, to_label, to_number
+from traps_pipeline.judging.judged_answers import is_correct, normalise, to_label, to_number
 
 SIDES = ["left", "right", "elsewhere"]
 ALIASES = {

@@ -16,7 +16,6 @@ from statsmodels.stats.proportion import proportion_confint
 from tests.judging.conftest import answered_study
 from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.judging import confabulation
 from traps_pipeline.judging.confabulation import (
     AXES,
@@ -32,12 +31,14 @@ from traps_pipeline.judging.confabulation import (
     sample_id,
     void_kind,
 )
+from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.judging.panel import parse_judgement
-from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.prevalence import prevalence
-from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
+from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import load_experiment
 from traps_pipeline.study.plan import Plan, make_plan

@@ -9,9 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
+from traps_pipeline.judging.human_label_rows import HUMAN_LABELS, LABELS_FILE, labels_version
+from traps_pipeline.judging.label_units import annotation_protocol, drawn_units, queue_of
 from traps_pipeline.judging.labels import (
     confabulation_rows,
     human_agreement,
@@ -19,8 +22,6 @@ from traps_pipeline.judging.labels import (
     matrix,
     truths,
 )
-from traps_pipeline.judging.people import annotation_protocol, drawn_units, queue_of
-from traps_pipeline.judging.people_tables import HUMAN_LABELS, LABELS_FILE, labels_version
 from traps_pipeline.storage.lines import checked_line
 
 PROTOCOL = annotation_protocol()
@@ -66,10 +67,10 @@ def test_labels_are_read_as_written_and_damage_is_named(tmp_path: Path) -> None:
     file.write_bytes(line(1) + line(2, who="ab") + line(3, unit="u2")[:40])  # the last one was never confirmed
     assert [(each.seq, each.who) for each in label_lines(tmp_path)] == [(1, "jd"), (2, "ab")]
     file.write_bytes(line(1).replace(b"true", b"fals") + line(2))
-    with pytest.raises(TrapsError, match=r"labels\.jsonl:1: is not what was written"):
+    with raises(TrapsError, "judging.labels.label_lines", "labels.jsonl"):
         label_lines(tmp_path)
     file.write_bytes(line(1, label={"correct": True}))
-    with pytest.raises(TrapsError, match=r"labels\.jsonl:1: .*abstained"):
+    with raises(TrapsError, "judging.labels.label_lines", "labels.jsonl", "abstained"):
         label_lines(tmp_path)
 
 
@@ -115,7 +116,7 @@ def test_most_people_decide_and_a_tie_decides_nothing() -> None:
         ("abstention", "u2", "jd", False), ("abstention", "u2", "ab", True),
     )  # fmt: skip
     assert truths(given, "abstention").set_index("unit")["truth"].to_dict() == {"u1": True, "u2": None}
-    with pytest.raises(ValueError, match="the panel decides nothing of the kind"):
+    with raises(ValueError, "judging.labels.truths"):
         truths(given, "answerability")
 
 
@@ -126,5 +127,5 @@ def test_labels_of_confabulation_are_written_of_failures_that_everybody_labelled
     rows = confabulation_rows(given)
     assert [(row["annotator"], row["sample_id"]) for row in rows] == [("ab", "s1"), ("jd", "s1")]
     assert [rows[0][axis] for axis in axes] == ["1", "0", "1", "0"]
-    with pytest.raises(TrapsError, match="no failure is labelled by everybody yet"):
+    with raises(TrapsError, "judging.labels.confabulation_rows"):
         confabulation_rows(given.iloc[:0])

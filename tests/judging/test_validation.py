@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +12,21 @@ import pytest
 from sklearn.metrics import accuracy_score, cohen_kappa_score, precision_recall_fscore_support
 from statsmodels.stats.inter_rater import cohens_kappa
 
+from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
 from tests.judging.conftest import answered_study
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
-from traps_pipeline.judging.confabulation import AXES, sample_id
-from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION, ConfabulationRow
+from traps_pipeline.judging.confabulation import AXES
+from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.judging.validation import (
-    LABEL_COLUMNS,
     HumanLabels,
     compare,
     is_degenerate,
     read_labels,
 )
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.storage.workspace import Workspace
-
-MODEL = "qwen3-vl-think"
+from traps_pipeline.protocol.cells import Cell, Evaluation
 
 
 def flags(text: str) -> np.ndarray:
@@ -106,14 +102,6 @@ def test_kappa_is_degenerate_where_a_class_has_two_percent_or_less_of_either_ann
 
 # --- files ------------------------------------------------------------------------------------------------------------
 
-HEAD = ",".join(LABEL_COLUMNS)
-GOOD = [f"{who},{sample},1,0,no,TRUE" for who in ("ann", "bob") for sample in ("s1", "s2")]
-
-
-def written(path: Path, *lines: str) -> Path:
-    (path / "labels.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path / "labels.csv"
-
 
 def test_labels_are_read_whatever_their_words_their_order_and_the_other_columns(tmp_path: Path) -> None:
     lines = [f"note,{HEAD}", *(f"x,{line}" for line in reversed(GOOD))]
@@ -141,31 +129,6 @@ def test_a_wrong_label_file_is_answered_with_line_and_column(tmp_path: Path, lin
     with pytest.raises(TrapsError) as raised:
         read_labels(written(tmp_path, *lines), ["s1", "s2"])
     assert complaint in str(raised.value)
-
-
-def labelled_study(root: Path, texts: Sequence[str]) -> Workspace:
-    """A study whose judge has called every failure a hallucinated premise and nothing else."""
-    cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
-    workspace = answered_study(root, {cell: {(k, "void"): text for k, text in enumerate(texts)}})
-    rows = [
-        ConfabulationRow(
-            **(
-                dict.fromkeys(CONFABULATION.names, "x")
-                | cell.partition
-                | {
-                    "sample_id": sample_id(cell, f"chaotic:s-{k:04d}:void", text.rpartition("<think>")[2], None),
-                    "item_id": f"chaotic:s-{k:04d}:void",
-                    "n_failures": 9,
-                    "created_at": datetime.now(UTC),
-                }
-                | {"void_kind": "truncation", "evidence": "output", "valid": True}
-                | {axis: axis == "hallucinated_premise" for axis in AXES}
-            )
-        )
-        for k, text in enumerate(texts)
-    ]
-    workspace.tables.write(CONFABULATION, {}, rows, {})
-    return workspace
 
 
 def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(

@@ -11,16 +11,17 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from tests.build.errors import raises
 from tests.judging.conftest import answered_study, vote_rows
 from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging import panel as judging
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.panel import collect_votes
-from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import decide, decide_cell
 from traps_pipeline.models.judges import JudgeEntry
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.storage.workspace import Workspace
 
@@ -95,15 +96,13 @@ def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None
     items, responses = undone("control")
     whole = control_votes("nnn", "yyy")
     for votes in (whole[whole["task"] == "abstention"], whole[whole["judge"] != "c"], whole.iloc[1:]):
-        with pytest.raises(
-            TrapsError, match=r"votes occlusion\|m__standard__run1: item occlusion:s-0000:control does not have"
-        ):
+        with raises(TrapsError, "judging.verdicts._refuse", "votes", "occlusion|m__standard__run1"):
             decide(items, responses, votes)
 
 
 def test_a_response_to_an_item_that_is_gone_is_refused_by_name() -> None:
     items, responses = undone("void")
-    with pytest.raises(TrapsError, match="item occlusion:s-0000:void is no longer in items"):
+    with raises(TrapsError, "judging.verdicts._refuse"):
         decide(items.iloc[:0], responses, vote_rows(["yyy"]))
 
 

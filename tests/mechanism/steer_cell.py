@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from tests.mechanism.study import register
-from traps_pipeline.base.partitions import Extraction, SteeringCell
 from traps_pipeline.mechanism import stages
+from traps_pipeline.mechanism.mechanism_rows import STEERING
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.steering import collect_steered
-from traps_pipeline.mechanism.tables import STEERING
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.protocol.cells import Extraction, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = SteeringCell.make("chaotic", "tiny", "standard", "guided")

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.base.partitions import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.study import MechanismSettings, Study
 from traps_pipeline.storage.tables import Row, Table

@@ -14,7 +14,7 @@ import pytest
 from tests.local_models import FAMILIES, Family, model
 from tests.models.local import check_table
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism import patching
+from traps_pipeline.mechanism import patching_effects
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import capture, prefixes
@@ -58,7 +58,7 @@ def rounded_features(patch: pytest.MonkeyPatch) -> None:
 
 
 def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(patching, "_patch_arguments", lambda _, __, ___, ____, args, kwargs: (args, kwargs))
+    patch.setattr(patching_effects, "_patch_arguments", lambda _, __, ___, ____, args, kwargs: (args, kwargs))
 
 
 def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:

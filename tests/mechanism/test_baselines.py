@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS, is_ill_posed, taxonomy_of
 from traps_pipeline.mechanism.baselines import noise_floor, raw_features, scored
 from traps_pipeline.mechanism.margin import begins_abstention
 from traps_pipeline.mechanism.probing import ProbeRun
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import ProbeSettings

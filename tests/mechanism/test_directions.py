@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.build.directions import origin, pair_states
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.directions import (
     KINDS,
     NULLS,
-    Origin,
     cosine_matrix,
     direction_scenarios,
     extract_directions,
@@ -24,16 +25,6 @@ from traps_pipeline.mechanism.directions import (
 )
 
 NAMES = [f"plinko-{n:04d}" for n in range(200)]
-
-
-def pair_states(layers: int = 3, pairs: int = 30, width: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(0)
-    control = rng.normal(size=(layers, pairs, width)).astype(np.float32)
-    return control + rng.normal(scale=0.1, size=control.shape).astype(np.float32), control
-
-
-def origin() -> Origin:
-    return Origin("m", "folder", "d1", "float32", "none", "chaotic", "standard", "last", 7, ("a", "b"), "d2")
 
 
 def test_the_void_direction_is_the_unit_mean_difference() -> None:
@@ -90,7 +81,7 @@ def test_a_layer_where_the_sides_are_equal_has_no_direction() -> None:
     made = extract_directions(void, control, [1])
     assert not made.void[0].any() and made.gaps[0] == 0
     assert not any(made.vectors[null][:, 0].any() for null in NULLS)  # nothing to be orthogonal to
-    with pytest.raises(TrapsError, match="needs two pairs at least"):
+    with raises(TrapsError, "mechanism.directions.extract_directions"):
         extract_directions(void[:, :1], control[:, :1], [1])
 
 
@@ -110,7 +101,7 @@ def test_a_discarded_scenario_moves_no_other() -> None:
 
 def test_directions_come_back_as_they_were_saved_and_damage_is_told(tmp_path: Path) -> None:
     made, path = extract_directions(*pair_states(), [1]), tmp_path / "a" / "chaotic.safetensors"
-    with pytest.raises(TrapsError, match="is missing; `traps run` makes both"):
+    with raises(TrapsError, "mechanism.directions.load_directions"):
         load_directions(path)
     save_directions(path, made, origin())
     back, said = load_directions(path)
@@ -121,7 +112,7 @@ def test_directions_come_back_as_they_were_saved_and_damage_is_told(tmp_path: Pa
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
-    with pytest.raises(TrapsError, match="damaged"):
+    with raises(TrapsError, "mechanism.directions.load_directions"):
         load_directions(path)
 
 

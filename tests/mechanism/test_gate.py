@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.mechanism.gate import (
     NEVER,
     OTHER_DATASETS,
@@ -17,6 +16,7 @@ from traps_pipeline.mechanism.gate import (
     risk_coverage,
     thresholds,
 )
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 
 
 def test_thresholds_are_the_ones_worked_out() -> None:

@@ -8,8 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +15,11 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from tests.local_models import FAMILIES, SIX_FRAMES, SYSTEM, Family, ask, clip, model, three_prompts
+from tests.build.states import work
+from tests.local_models import FAMILIES, Family, ask, clip, model, three_prompts
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.hidden_states import Item, clip_item, damage, extract, read_layer, read_record
+from traps_pipeline.mechanism.hidden_states import damage, extract, read_layer, read_record
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
 from traps_pipeline.models.local.capture import pool
 from traps_pipeline.storage.store import LEASES
@@ -69,23 +68,6 @@ def test_a_kept_state_keeps_no_other_alive() -> None:
 
 
 # --- extraction -------------------------------------------------------------------------------------------------------
-
-
-def work(of: LocalModel, n: int = 5, opened: Callable[[int], None] = lambda i: None, **changed: str) -> list[Item]:
-    """Items with different questions; `opened` is called whenever a prompt is made. changed: questions by item id."""
-
-    def item(i: int) -> Item:
-        question = changed.get(f"item{i}", f"Does it stop after {i} s?")
-        row = {"item_id": f"item{i}", "side": ("control", "void")[i % 2], "question": question}
-        made = clip_item(of, SIX_FRAMES, row | {"media_digest": file_digest(clip())}, clip(), SYSTEM)
-
-        def prompt() -> Prompt:
-            opened(i)
-            return made.prompt()
-
-        return replace(made, prompt=prompt)
-
-    return [item(i) for i in range(n)]
 
 
 @each_family
@@ -153,7 +135,7 @@ def test_states_made_on_another_device_say_so_item_by_item(
 SLOW = """
 import sys, time
 from pathlib import Path
-from tests.mechanism.test_hidden_states import work
+from tests.build.states import work
 from tests.local_models import model
 from traps_pipeline.mechanism.hidden_states import extract
 of = model("qwen3-vl")

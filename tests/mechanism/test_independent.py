@@ -24,7 +24,7 @@ from tests import local_models
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
 from traps_pipeline.mechanism.made_answers import MadeAnswers
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching import SITES, Patch, Site, patched_changes, record
+from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
 from traps_pipeline.mechanism.probes import Solver, auroc, fit_probe
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model

@@ -17,7 +17,6 @@ from tests.conftest import ROOT
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_verdicts
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, DATASETS, TIME_SWAPPED, Extraction, StatesCell
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import RAW, baseline_rows, output_margins
 from traps_pipeline.mechanism.contrast import _loss
@@ -26,14 +25,16 @@ from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.other_probes import Eraser
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probes import auroc, scenario_folds
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.workspace import Workspace
 

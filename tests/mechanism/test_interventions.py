@@ -17,21 +17,21 @@ from tests.mechanism.study import make_study, register, tiny_entry
 from traps_pipeline import inside
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Extraction, StatesCell, SteeringCell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism import stages, steering
 from traps_pipeline.mechanism.deciding import conditions
 from traps_pipeline.mechanism.directions import steered_scenarios
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, STEERING, SteeringRow
 from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.probing_versions import loaded_params, steering_version
 from traps_pipeline.mechanism.steering import NO_STEERING, Strength, collect_steered, steered_request
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, STEERING, SteeringRow
-from traps_pipeline.mechanism.versions import loaded_params, steering_version
 from traps_pipeline.models.local.adapter import Prompt, load_local_model
 from traps_pipeline.models.local.prefixes import PrefixMemory
 from traps_pipeline.models.local.spans import spans
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.media import profile_digest, sample
 from traps_pipeline.storage.study import ACTING, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

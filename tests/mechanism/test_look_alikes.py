@@ -15,23 +15,24 @@ import pytest
 import torch
 
 from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
-from traps_pipeline.base.partitions import DATASETS, Extraction, StatesCell
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.control_tables import GateRow
+from traps_pipeline.mechanism.control_rows import GateRow
 from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS
 from traps_pipeline.mechanism.gating import UNTRAINED, gate_rows
-from traps_pipeline.mechanism.paths import LOOK_ALIKES
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBE_ITEMS, PROBES
+from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.mechanism.untrained import untrained_states
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pandas as pd
 import pytest
 
@@ -9,7 +11,7 @@ from traps_pipeline.mechanism.degeneracy import degeneracy, language
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
 
 
-def effect(kind: str, side: str, dose: float, abstained: int, draw: int = 0, signs: str = "label") -> dict[str, object]:
+def effect(kind: str, side: str, dose: float, abstained: int, draw: int = 0, signs: str = "label") -> dict[str, Any]:
     about = {"model": "m", "directions": "standard", "regime": "guided", "source": "chaotic", "target": "chaotic"}
     counts = {"n": 10, "n_missing": 0, "abstained": abstained, "abstention": abstained / 10, "degenerate": 0}
     right = {"correct": 10 - abstained, "n_correct": 10} if side == "control" else {"correct": 0, "n_correct": 0}

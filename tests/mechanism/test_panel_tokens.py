@@ -9,13 +9,14 @@ import pytest
 
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, Extraction, StatesCell
 from traps_pipeline.benchmark.tables import VIDEOS, VideoRow
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.hidden_states import read_layer
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, HiddenStatesRow
 from traps_pipeline.mechanism.probe_items import other_clip, probe_items
-from traps_pipeline.mechanism.tables import PROBE_ITEMS, HiddenStatesRow
-from traps_pipeline.mechanism.versions import extraction_version, states_folder
+from traps_pipeline.mechanism.probing_versions import extraction_version, states_folder
+from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.datasets import ANSWERABLE
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

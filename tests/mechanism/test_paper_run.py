@@ -8,8 +8,8 @@ import pytest
 
 from tests.conftest import Checkout
 from tests.mechanism.paper_run import BLOCKS, DEPTHS, mechanism, paper, write
-from traps_pipeline.base.partitions import DATASETS
-from traps_pipeline.mechanism.tables import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
 SCENARIOS = ["domino_chain-0001", "domino_chain-0002", "plinko-0001", "plinko-0002"]

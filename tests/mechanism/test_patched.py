@@ -14,19 +14,20 @@ import pytest
 from tests.local_models import SYSTEM, ask, clip, model
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.base.partitions import SIDES, Extraction
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism import patched
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.patched import Side, _groups, _summed, effect_of, patching_rows
-from traps_pipeline.mechanism.patching import Patch, Recorded, record
+from traps_pipeline.mechanism.patching_effects import Patch, Recorded, record
 from traps_pipeline.mechanism.probe_items import probe_items
-from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.protocol.cells import Extraction
+from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.workspace import Workspace

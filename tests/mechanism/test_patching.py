@@ -17,7 +17,15 @@ from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, Site, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.patching_effects import (
+    SITES,
+    Patch,
+    Recorded,
+    Site,
+    patched_changes,
+    record,
+    require_patchable,
+)
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.spans import PARTS, spans
 from traps_pipeline.models.local.tiny import build_tiny

@@ -9,9 +9,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 from sklearn.preprocessing import StandardScaler
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, DATASETS, LONG, TIME_SWAPPED, transfer_type
-from traps_pipeline.mechanism.paths import STEERING_PATHS, TRANSFER_PAIRS
 from traps_pipeline.mechanism.probes import (
     Split,
     auroc,
@@ -25,6 +24,8 @@ from traps_pipeline.mechanism.probes import (
     within_split,
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS, TRANSFER_PAIRS
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, LONG, TIME_SWAPPED, transfer_type
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.scoring.published import published
 from traps_pipeline.storage.study import ProbeSettings
@@ -120,7 +121,7 @@ def test_folds_keep_a_scenario_together_and_differ_by_one_at_most() -> None:
     assert all(len(set(folds[scenario == s])) == 1 for s in range(13))
     sizes = [len(set(scenario[folds == f])) for f in range(5)]
     assert sorted(sizes) == [2, 2, 3, 3, 3]
-    with pytest.raises(TrapsError, match="5 folds need 5 scenarios, but there are 4"):
+    with raises(TrapsError, "mechanism.probes.scenario_folds"):
         scenario_folds(np.arange(4), 5, seed=1)
 
 
@@ -141,9 +142,9 @@ def test_shuffled_labels_give_half_on_average_even_where_the_signal_is_perfect()
 
 def test_states_that_are_no_numbers_and_a_missing_class_are_told() -> None:
     states, void = random_states(20, 5)
-    with pytest.raises(TrapsError, match="needs void and control items, but 20 of 20 items are void"):
+    with raises(TrapsError, "mechanism.probes._check_labels", "20"):
         fit_probe(states, np.ones(20, bool))
-    with pytest.raises(TrapsError, match="no probe can be fitted to these 20 rows"):
+    with raises(TrapsError, "mechanism.probes.solve_gram"):
         solve_gram(np.full((20, 20), np.nan), void)
 
 
@@ -338,12 +339,12 @@ def test_a_sub_scenario_whose_voids_look_like_controls_is_not_caught_and_the_oth
 def test_a_layer_out_of_range_and_missing_states_are_told() -> None:
     items, states = study(pairs=4)
     settings = ProbeSettings(resamples=100)
-    with pytest.raises(TrapsError, match="centroid layer 32 is out of range; there are states of layers 0 to 3"):
+    with raises(TrapsError, "mechanism.probing.ProbeRun.__post_init__", "32"):
         ProbeRun(items, lambda d, n: states[d, n], LAYERS, 32, settings, 7)
-    with pytest.raises(TrapsError, match="no hidden states of any dataset"):
+    with raises(TrapsError, "mechanism.probing.ProbeRun.__post_init__"):
         ProbeRun(items.iloc[:0], lambda d, n: states[d, n], LAYERS, 1, settings, 7)
     short = ProbeRun(items, lambda d, n: states[d, n][:3], LAYERS, 1, settings, 7)
-    with pytest.raises(TrapsError, match="hidden states of occlusion, layer 0"):
+    with raises(TrapsError, "mechanism.probing.ProbeRun._split", "occlusion"):
         short.layer_rows(0)
 
 
@@ -353,7 +354,7 @@ def test_confabulated_items_are_decided_voids_that_were_answered() -> None:
         columns=["scenario_id", "side", "abstained"],
     )
     assert confabulated_scenarios(verdicts, "chaotic", "m") == {"a"}
-    with pytest.raises(NothingConfabulated, match="m confabulated on none of the 1 judged void items of chaotic"):
+    with raises(NothingConfabulated, "mechanism.probing.confabulated_scenarios", "chaotic"):
         confabulated_scenarios(verdicts[1:3], "chaotic", "m")
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
-from traps_pipeline.mechanism.paths import STEERING_PATHS
 from traps_pipeline.mechanism.shares import effect_rows, share_rows
 from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
+from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import resampled_sums
 
 ABSTAINS = "s0"  # of two scenarios the one on whose void the model always abstains

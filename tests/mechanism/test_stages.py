@@ -8,27 +8,34 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from tests.build.mechanism import STANDARD, entry, extract_all, own, patch, study
 from tests.conftest import ROOT
 from tests.mechanism.steer_cell import CELL
-from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
+from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, DATASETS, TIME_SWAPPED, Extraction, StatesCell, SteeringCell
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.baselines import baseline_rows
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.mechanism_rows import (
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING,
+    STEERING_VOTES,
+)
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
-from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.shares import effect_rows, of_paper
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
@@ -38,60 +45,21 @@ from traps_pipeline.mechanism.steering import (
     strengths,
 )
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
+__all__ = ["entry", "own", "patch", "study"]  # fixtures
+
 pytestmark = pytest.mark.slow
-
-STANDARD = Extraction("tiny", "standard")
-
-
-@pytest.fixture(scope="module")
-def patch() -> Iterator[pytest.MonkeyPatch]:
-    with pytest.MonkeyPatch.context() as patch:
-        yield patch
-
-
-@pytest.fixture(scope="module")
-def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> ModelEntry:
-    made = tiny_entry(tmp_path_factory.mktemp("tiny") / "checkpoint")
-    register(patch, made)
-    return made
-
-
-def extract_all(workspace: Workspace) -> int:
-    made = 0
-    for dataset in (*DATASETS, ANSWERABLE, TIME_SWAPPED):
-        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
-        cell = StatesCell(dataset, STANDARD)
-        rows, new = stages.extract_states(workspace, cell)
-        workspace.tables.write(HIDDEN_STATES, cell.partition, rows, {})
-        made += new
-    return made
-
-
-@pytest.fixture(scope="module")
-def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Extracted, with directions."""
-    workspace = make_study(tmp_path_factory.mktemp("study"))
-    assert extract_all(workspace) == 4 * 2 * PAIRS + PAIRS + 2 * PAIRS
-    workspace.tables.write(DIRECTIONS, STANDARD.partition, stages.direction_rows(workspace, STANDARD), {})
-    return workspace
-
-
-@pytest.fixture
-def own(study: Workspace, tmp_path: Path) -> Workspace:
-    """A copy to be changed."""
-    shutil.copytree(study.root, tmp_path / "study", symlinks=True)
-    return Workspace.open(tmp_path / "study")
 
 
 def test_answerable_items_are_the_void_clips_with_the_question_that_they_answer(study: Workspace) -> None:

@@ -11,8 +11,8 @@ import pytest
 
 from tests.build.inside import with_mechanism
 from tests.conftest import Checkout, Finished, copied, once
-from traps_pipeline.mechanism.control_tables import PATCHING, PROBE_BASELINES, STEERING_NULLS
-from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
+from traps_pipeline.mechanism.control_rows import PATCHING, PROBE_BASELINES, STEERING_NULLS
+from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS, STEERING_VOTES
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -6,10 +6,10 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
-from traps_pipeline.mechanism.tables import STEERING_EFFECTS
+from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
+from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.tables import mechanism, probes
+from traps_pipeline.report.tables import probe_tables, steering_tables
 from traps_pipeline.scoring.published import published, published_rows
 
 PAPER = PublishedResults()
@@ -40,7 +40,7 @@ def test_means_over_the_eight_transfer_paths_are_those_of_the_papers_text() -> N
 
 
 def test_the_printed_alpha_10_table_is_the_top_of_the_dose_table() -> None:
-    top = next(t for t in mechanism.steering(PAPER) if t.name == "steering_top").rows
+    top = next(t for t in steering_tables.steering(PAPER) if t.name == "steering_top").rows
     mine = top.query("model == 'qwen3-vl-8b'").set_index(["source", "target"])[["control", "void"]]
     printed = PAPER.effects.query("model == 'qwen3-vl-8b' and alpha == 10")
     printed = printed.pivot(index=["source", "target"], columns="side", values="abstention")
@@ -82,7 +82,7 @@ def test_the_sweep_is_the_mean_of_four_splits_on_their_own_controls() -> None:
 
 
 def test_means_over_four_paths_differ_between_all_samples_and_cf_by_what_the_paper_claims() -> None:
-    means = next(t for t in probes.probes(PAPER) if t.name == "probe_means").rows
+    means = next(t for t in probe_tables.probes(PAPER) if t.name == "probe_means").rows
     qwen = means.query("model == 'qwen3-vl-8b'")
     assert qwen["transfer_type"].tolist() == list(TRANSFER_TYPES[:3]) and set(qwen["n_paths"]) == {4}
     assert (qwen["best_value"] - qwen["cf_value"]).abs().max() == pytest.approx(0.03, abs=0.005)
@@ -94,7 +94,7 @@ def test_published_rows_without_a_figure_are_left_out_and_not_invented() -> None
     assert cosines["qwen3-vl-8b", "occlusion", "chaotic"] == -0.05
     assert cosines["gemma-4-e4b", "chaotic_ill_posed", "chaotic"] == 0.55
     assert ("llava-next-video-7b", "chaotic", "occlusion") not in cosines.index
-    answerable = next(t for t in probes.probes(PAPER) if t.name == "probe_answerable")
+    answerable = next(t for t in probe_tables.probes(PAPER) if t.name == "probe_answerable")
     assert answerable.absence == "not run: the paper has no such control"
     assert set(PAPER.effects["directions"]) == {"standard"} and set(PAPER.effects["regime"]) == {"guided"}
 
@@ -106,5 +106,5 @@ def test_a_study_that_steers_no_guided_directions_says_so_where_families_would_s
     made = Made()
     rows = made_up(BASE).reindex(columns=pd.Index(STEERING_EFFECTS.names))
     made.made["effects"] = rows.assign(directions="standard")
-    (table,) = (t for t in mechanism.steering(made) if t.name == "steering_families")
+    (table,) = (t for t in steering_tables.steering(made) if t.name == "steering_families")
     assert table.absence == "not run: no directions of the guided prompt were steered under guided inference"

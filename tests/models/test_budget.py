@@ -16,7 +16,6 @@ from pydantic import ValidationError
 from tests.build.ledger import budget as budget_of
 from tests.build.ledger import budget_in, local, paid
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.ledger.money import Money, Releasable
 from traps_pipeline.models.ask import Call, Work, run_work
 from traps_pipeline.models.budget import (
@@ -30,6 +29,7 @@ from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.models.spending import spending
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

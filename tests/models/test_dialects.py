@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
 
 LEFT = "The ball rolls to the left."
@@ -92,7 +93,7 @@ def test_an_incomplete_response_says_why() -> None:
 @pytest.mark.parametrize("dialect", ["chat", "anthropic", "gemini"])
 @pytest.mark.parametrize("finish", [None, "", 7, ["stop"]])
 def test_an_answer_that_does_not_say_why_it_ended_is_no_complete_answer(dialect: str, finish: Any) -> None:
-    with pytest.raises(OddShapeError, match="gives no finish reason"):
+    with raises(OddShapeError, "models.dialects.read_reply"):
         read(dialect, MAKERS[dialect](finish))
 
 

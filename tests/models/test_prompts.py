@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.prompts import FIELDS, PROMPTS, prompt, prompt_version, system_prompt
 
@@ -41,5 +40,5 @@ def test_the_files_say_what_the_paper_says() -> None:
 
 
 def test_a_missing_prompt_is_named_with_the_remedy() -> None:
-    with pytest.raises(TrapsError, match=r"prompts/no_such\.txt: cannot be read .*restore it from git"):
+    with raises(TrapsError, "models.prompts.prompt", "prompts/no_such.txt"):
         prompt("no_such")

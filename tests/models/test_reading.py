@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.models.reading import Reading, degenerate, read_answer
 from traps_pipeline.models.thinking import USUAL, how_to_declare, marks_of, strip_fence, strip_tokens
 
@@ -147,7 +148,7 @@ def test_thoughts_between_visible_texts_are_taken_out_and_the_texts_stay() -> No
 
 @pytest.mark.parametrize("declared", ["<ponder>", ["<a>"], ["<a>", "<a>"], ["<a>", ""], "", []])
 def test_marks_are_both_declared_or_the_usual_ones(declared: Any) -> None:
-    with pytest.raises(ValueError, match="<think>"):
+    with raises(ValueError, "models.thinking.marks_of", "<think>"):
         marks_of(declared)
     assert marks_of(["<ponder>", "</ponder>"]) == ("<ponder>", "</ponder>")
 

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import REGIMES, Evaluation
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Evaluation
+from traps_pipeline.protocol.regimes import REGIMES
 
 GROUPS = "groups: {family: f, access: none, input: none, group: g}"
 
@@ -63,12 +65,12 @@ def test_a_file_without_models_says_what_it_must_hold(tmp_path: Path) -> None:
     for text in ("", "[]", "judges: []", "models: 3"):
         path.write_text(text)
         load_models.cache_clear()
-        with pytest.raises(TrapsError, match=r"models\.yaml: must hold a list `models:`"):
+        with raises(TrapsError, "models.registry.read_entries", "models.yaml", "models"):
             load_models(path)
 
 
 def test_an_unknown_model_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(TrapsError, match=r"unknown model 'gpt-6'; .*models\.yaml has .*gpt-5"):
+    with raises(TrapsError, "models.registry.get_model", "gpt-6", "31"):
         get_model("gpt-6")
 
 

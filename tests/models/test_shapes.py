@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import datetime
 import json
 import os
 import socket
@@ -13,35 +12,25 @@ from typing import Any
 
 import pytest
 
+from tests.build.calls import ANSWER, BODY, CHOICE, MESSAGE, PARAMS, USAGE, allowed_by, body, entry_of, request
 from tests.build.ledger import budget as budget_of
 from tests.build.ledger import budget_in, local
 from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.ask import Call, Work, run_work
-from traps_pipeline.models.budget import Budget, BudgetReached
-from traps_pipeline.models.participants import OVERRUN, Allowed, Participants, attempt
-from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.models.participants import OVERRUN, Participants, attempt
+from traps_pipeline.models.registry import Account, Entry
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 
 # litellm serializes what it was given again; what it says of odd values goes to nobody.
 pytestmark = pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")
-PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
-PRICES = Prices(input=1.0, output=10.0, as_of=datetime.date(2026, 11, 1))
 USD_A_TOKEN = (1e-6, 1e-5)
-ANSWER = "The answer is: left."
-USAGE = {"prompt_tokens": 20, "completion_tokens": 21, "total_tokens": 41}
-MESSAGE = {"role": "assistant", "content": ANSWER}
-CHOICE = {"index": 0, "message": MESSAGE, "finish_reason": "stop"}
-BODY = {"id": "x", "object": "chat.completion", "created": 1, "model": "m", "choices": [CHOICE], "usage": USAGE}
-
-
-def body(**changes: Any) -> str:
-    return json.dumps(BODY | changes)
 
 
 def usage(**changes: Any) -> str:
@@ -140,29 +129,12 @@ def odd(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
     return shared_provider.afresh(raw_by_model=raw, usd_a_token=USD_A_TOKEN)
 
 
-def entry_of(model: str, **limits: Any) -> Entry:
-    fields = {"id": "m", "backend": "api", "account": "a", "provider_id": f"openai/{model}", "params": PARAMS}
-    fields |= {"limits": Limits(timeout_s=5, backoff_s=0.001, retries=1, **limits), "prices": PRICES}
-    return Entry.model_validate(fields, context={"accounts": {"a": Account()}})
-
-
 def asking(provider: Provider, entry: Entry) -> ApiBackend:
     return ApiBackend(entry, Account(key=KEY, base_url=f"{provider.url}/v1"))
 
 
-def request(item: int | str = "x") -> Request:
-    return Request("m", "openai/m", PARAMS, "You watch a clip of two balls.", f"Which one, {item}?", {"item_id": item})
-
-
 def participants(provider: Provider, entry: Entry, cap_usd: float) -> Participants:
     return Participants({"m": entry}, lambda _: asking(provider, entry), Study(budget_usd=cap_usd), {"a": Account()})
-
-
-def allowed_by(budget: Budget) -> Allowed:
-    async def require() -> None:
-        """No other process is there."""
-
-    return Allowed(budget, asyncio.Event(), lambda: False, require)
 
 
 def booked_for(provider: Provider, model: str) -> tuple[Outcome | None, float]:

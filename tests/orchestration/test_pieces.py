@@ -33,7 +33,7 @@ class Report:
             self.made[name] += 1
             return {f"tables/{name}.md": f"{name}, made {self.made[name]} times".encode()}
 
-        return Piece(name, reads, make)
+        return Piece(name, make, reads)
 
     def make(self, *, code: str = "1", names: tuple[str, ...] = ("overall", "sub_scenarios")) -> list[str]:
         reads = {"overall": ("leaderboard",), "sub_scenarios": ("metrics", "items")}
@@ -80,3 +80,18 @@ def test_files_of_a_table_that_is_no_more_are_removed(report: Report) -> None:
 def test_a_note_that_cannot_be_read_makes_all_again(report: Report) -> None:
     (report.workspace.reports / ".state" / "report_tables.pieces.json").write_text("{")
     assert report.make() == ["overall", "sub_scenarios"]
+
+
+def test_a_picture_is_made_again_when_the_rows_that_it_shows_change_and_not_with_their_table(
+    report: Report, versions: dict[str, str]
+) -> None:
+    def made_again(rows: list[str]) -> list[str]:
+        picture = Piece("sheet", lambda: {"sheet.png": repr(rows).encode()}, inputs=rows)
+        files, remade = make_pieces(report.workspace, "contact_sheet", "1", [picture])
+        report.workspace.store.write({report.workspace.reports / path: data for path, data in files.items()})
+        return remade
+
+    assert made_again(["plinko-0001"]) == ["sheet"]
+    versions["metrics/chaotic"] = "2"
+    assert made_again(["plinko-0001"]) == []
+    assert made_again(["plinko-0002"]) == ["sheet"]

@@ -12,13 +12,14 @@ import pytest
 from dagster import AssetObservation, PartitionKeyRange
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.ranges import batches
 from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.schemes import CELL, DATASET
 from traps_pipeline.orchestration.translation import partitions_of
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

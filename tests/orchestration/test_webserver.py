@@ -12,17 +12,23 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
 import uvicorn
+from starlette.applications import Starlette
+from starlette.testclient import TestClient
 
 from tests.foreign_page import CHROMIUM, attack
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import Guard, token_for
 from traps_pipeline.cli import main
-from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE
+from traps_pipeline.orchestration.previews import StudyFile
+from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE, study_route
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 TOKEN = "a-token-of-a-test-0123"
 JSON = {"Content-Type": "application/json"}
@@ -171,3 +177,18 @@ def test_beyond_this_machine_a_token_of_ones_own_is_wanted(
     assert token_of("192.0.2.1", TOKEN) == TOKEN
     assert token_of("127.0.0.1", None) != token_of("127.0.0.1", None)
     assert len(json.dumps(token_of("::1", None))) > 30
+
+
+def test_the_report_and_clips_of_a_study_are_served_and_nothing_else_of_it(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    for name in ("reports/report.html", "reports/.state/gallery.json", "clips/a-1/void.mp4", "outside.txt"):
+        (workspace.root / name).parent.mkdir(parents=True, exist_ok=True)
+        (workspace.root / name).write_bytes(b"0123456789")
+    (workspace.root / "reports" / "link.html").symlink_to(workspace.root / "study.yaml")
+    client = TestClient(Starlette(routes=[study_route(workspace)]))
+    assert client.get(StudyFile("reports/report.html").url).text == "0123456789"
+    part = client.get("/study/clips/a-1/void.mp4", headers={"Range": "bytes=2-4"})  # as a browser seeks in a clip
+    assert (part.status_code, part.text) == (206, "234")
+    outside = ("study.yaml", "outside.txt", "ledger/answers", "reports/../study.yaml", "reports/%2e%2e/study.yaml")
+    for path in (*outside, "reports/.state/gallery.json", "reports/link.html", "reports", "clips//etc/passwd"):
+        assert client.get(f"/study/{path}").status_code == 404, path

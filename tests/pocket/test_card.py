@@ -14,9 +14,9 @@ from tools.pocket.evaluate import MODEL, markdown, read_cells
 from tools.pocket.planted import planted
 from tools.pocket.recipe import load_recipe
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.tables import VERDICTS
-from traps_pipeline.mechanism.control_tables import GATE, PATCHING, STEERING_NULLS
-from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
+from traps_pipeline.judging.judging_rows import VERDICTS
+from traps_pipeline.mechanism.control_rows import GATE, PATCHING, STEERING_NULLS
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import folder_digest
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

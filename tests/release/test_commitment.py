@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Checkout, make_checkout, once
+from tests.build.commitments import committed
+from tests.conftest import Checkout, make_checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.cli import main
 from traps_pipeline.release.commitment import (
     broken_seals,
     commit,
@@ -22,21 +22,9 @@ from traps_pipeline.release.commitment import (
     same_scene,
 )
 
+__all__ = ["committed"]  # a fixture
+
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a sampled benchmark of one scenario, its commitment and its reveal."""
-    from traps_pipeline.benchmark.composition import sample_benchmark
-
-    def make(folder: Path) -> str:
-        sample_benchmark(folder / "private", {"hidden_drop": 1}, 2026, "private", workers=1)
-        files = ("--out", folder / "commitment.json", "--reveal", folder / "reveal.json")
-        assert main(["commit", *map(str, (folder / "private", *files))]) == 0
-        return ""
-
-    return once(tmp_path_factory, "committed", make)
 
 
 @pytest.fixture

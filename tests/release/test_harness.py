@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from tests.release.environments import run_in
 from traps_pipeline.base.errors import TrapsError
@@ -20,7 +21,6 @@ from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
 from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
-from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.exchange import Whose, import_answers
@@ -52,15 +52,6 @@ def answers(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> P
     path = tmp_path_factory.mktemp("answers") / "answers.json"
     path.write_text(json.dumps(found))
     return path
-
-
-def ours(workspace: Workspace, model: str, regime: str) -> dict[str, float]:
-    """The leaderboard's figures under the names of a harness."""
-    board = workspace.tables.read_all(LEADERBOARD)
-    rows = board.loc[(board["model"] == model) & (board["regime"] == regime)].to_dict("records")
-    prefixed = {"" if row["dataset"] == "overall" else f"{row['dataset']}_": row for row in rows}
-    assert len(prefixed) == 5
-    return {f"{prefix}{name}": row[name] for prefix, row in prefixed.items() for name in FIGURES}
 
 
 def test_the_harness_scores_every_model_and_regime_of_the_demo_as_the_demo_does(

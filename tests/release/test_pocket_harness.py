@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.harness import ours
 from tests.conftest import ROOT, Checkout
 from tests.release.environments import python_of, run_in
-from tests.release.test_harness import ours
 from tests.serving import transformers_serve
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.harness.scoring import FIGURES

@@ -13,7 +13,7 @@ from tests.conftest import Checkout
 from tests.release.environments import run_in
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.release.results import Who, write_results
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -22,8 +22,8 @@ from traps_pipeline.release.submission import ABOUT, TABLES, _zipped, pack, read
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.tables import SUBMITTED
 from traps_pipeline.release.verification import verify
-from traps_pipeline.scoring.board import score
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.scoring.scored import score
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

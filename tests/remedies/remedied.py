@@ -6,40 +6,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from types import TracebackType
 from typing import TypeVar
 
-import pytest
-from pydantic import ValidationError
-
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import build_parser
 from traps_pipeline.storage.workspace import VARIABLE
 
-PACKAGE = "traps_pipeline."
 T = TypeVar("T")
-
-
-def raised_in(error: BaseException) -> str:
-    """Return the innermost function of the package in a traceback, as `base.files.replacing`.
-
-    Otherwise the model of pydantic that refused, or nothing.
-    """
-    function, frames = "", error.__traceback__
-    while isinstance(frames, TracebackType):
-        module = frames.tb_frame.f_globals.get("__name__", "")
-        if module.startswith(PACKAGE):
-            function = f"{module.removeprefix(PACKAGE)}.{frames.tb_frame.f_code.co_qualname}"
-        frames = frames.tb_next
-    return error.title if not function and isinstance(error, ValidationError) else function
 
 
 def refused(call: Callable[[], T], by: str, *, error: type[BaseException] = TrapsError) -> Callable[[], T]:
     """Return `call` after it ended in `error`, raised in the function or module `by`; any of the package if empty."""
-    with pytest.raises(error) as caught:
+    with raises(error, by):
         call()
-    function = raised_in(caught.value)
-    assert not by or f"{function}.".startswith(f"{by}."), f"raised in {function}, not {by}: {caught.value}"
     return call
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from tests.build.frames import frames
 from tests.remedies.remedied import remedied
-from tests.scenes.test_encode import frames
 from traps_pipeline.benchmark.corrections import Correction, check_benchmark, fold, read_corrections
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import RELEASED, load_released

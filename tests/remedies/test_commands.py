@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.build.entries import nobodys_own
 from tests.conftest import EXPERIMENT, KEY, ROOT, Checkout
 from tests.providers.server import Provider
 from tests.remedies.remedied import command, refused, remedied
-from tests.remedies.test_models import nobodys_own
 from traps_pipeline.base import paths
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS

@@ -9,22 +9,21 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.explorer.test_labelstore import YES
+from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
 from tests.judging.conftest import answered_study, judge_at
-from tests.judging.test_validation import GOOD, HEAD, MODEL, labelled_study, written
 from tests.providers.server import Provider
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
+from traps_pipeline.judging.judging_rows import CONFABULATION, VOTES
 from traps_pipeline.judging.labels import LABELS_FILE, label_lines
 from traps_pipeline.judging.panel import collect_votes, judged_answers, wanted_ballots
 from traps_pipeline.judging.robustness import check_panel, load_attacks
-from traps_pipeline.judging.tables import CONFABULATION, VOTES
 from traps_pipeline.judging.validation import annotation_sheet, read_labels, write_sheet
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -164,7 +163,7 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     store = LabelStore(tmp_path)
     for unit in ("u1", "u2"):
         store.show("jd", "abstention", unit, "plinko-0001")
-        store.record("jd", "abstention", unit, YES)
+        store.record("jd", "abstention", unit, {"abstained": True})
     path, kept = tmp_path / LABELS_FILE, tmp_path / "copy"
     shutil.copy(path, kept)
     path.write_bytes(path.read_bytes().replace(b'"u1"', b'"u9"', 1))

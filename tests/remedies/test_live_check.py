@@ -6,11 +6,11 @@ import socket
 
 import pytest
 
-from tests.base.test_webguard import PEOPLE, ask
+from tests.build.guard import PEOPLE, ask
+from tests.build.live import NAME, Check, check
 from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.remedies.remedied import remedied
-from tests.study.test_live_check import NAME, Check, check
 from traps_pipeline.base.webguard import public_name, token_for
 
 __all__ = ["check"]  # the fixture

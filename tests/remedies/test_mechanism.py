@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.directions import origin, pair_states
+from tests.build.mechanism import STANDARD, entry, own, patch, study
 from tests.mechanism.study import PAIRS, SETTINGS, write_verdicts
-from tests.mechanism.test_directions import origin, pair_states
-from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import remedied
-from traps_pipeline.base.partitions import StatesCell
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.directions import extract_directions, load_directions, save_directions
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.patched import patching_rows
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import StatesCell
 from traps_pipeline.storage.study import Asked, MechanismSettings, PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -141,7 +141,7 @@ def test_a_model_that_cannot_be_patched_is_left_out(
 
     nothing = remedied(
         patched_if_wanted,
-        "mechanism.patching.require_patchable",
+        "mechanism.patching_effects.require_patchable",
         lambda: Workspace.open(own.root).allow(mechanism=patching.model_copy(update={"patching": None})),
     )
     assert nothing is None

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
+from tests.build.entries import nobodys_own
 from tests.build.ledger import answer, write
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.models import own, prompts
+from traps_pipeline.models import prompts
 from traps_pipeline.models.local.settings import LocalParams
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import Account
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 from traps_pipeline.study.experiment import Experiment, load_experiment
+
+__all__ = ["nobodys_own"]  # fixtures
 
 MINE = """
 name: mine
@@ -31,14 +34,6 @@ models:
     media: images
 """
 LOCAL = {"checkpoint": "x", "dtype": "float32", "quantisation": "none", "do_sample": False, "max_new_tokens": 9}
-
-
-@pytest.fixture(autouse=True)
-def nobodys_own() -> Iterator[None]:
-    """Entries that a test adds are forgotten at its end."""
-    yield
-    own.use(own.Own(), Path("none"))
-    own.forget()
 
 
 PUBLIC = MINE.replace("http://127.0.0.1:8000", "https://example.org")

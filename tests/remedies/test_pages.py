@@ -8,10 +8,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from tests.build.canary import asked
+from tests.build.entries import nobodys_own
 from tests.conftest import Checkout
 from tests.remedies.remedied import refused, remedied
-from tests.remedies.test_models import nobodys_own
-from tests.study.test_canary import asked
 from traps_pipeline.explorer import site
 from traps_pipeline.explorer.site import write_site
 from traps_pipeline.orchestration.run import dagster_history

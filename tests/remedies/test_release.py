@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.commitments import committed
 from tests.conftest import Checkout
-from tests.release.test_commitment import committed
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.release.checksums import CHECKSUMS, read_checksums
@@ -19,7 +19,7 @@ from traps_pipeline.release.harness.write import write_harness
 from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.release.submission import pack, read_submission
 from traps_pipeline.release.verification import verify
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

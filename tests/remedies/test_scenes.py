@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.build.families import Add, add
 from tests.remedies.remedied import remedied
-from tests.scenes.test_registry import Add, add
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes import family_registry as registry
 from traps_pipeline.scenes.parts.course import Course

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from tests.build.ledger import answer, local, write
+from tests.build.media import IMAGES, VIDEO, write_clip
+from tests.build.video_rows import PARTITION, clip
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
-from tests.storage.test_media import IMAGES, VIDEO, write_clip
-from tests.storage.test_parquet import PARTITION, clip
 from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
 from traps_pipeline.ledger.transfer import export_ledger, import_ledger

@@ -13,7 +13,6 @@ import pytest
 
 from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.remedies.remedied import refused
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs import judging, report, scoring
@@ -22,6 +21,7 @@ from traps_pipeline.explorer.answers import study_items
 from traps_pipeline.explorer.review import Review
 from traps_pipeline.models.answers import wanted_questions
 from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
 from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.worlds.clips import read_clip
@@ -45,7 +45,7 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     again: list[Callable[[], Any]] = [
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
         refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
-        refused(cards["sheet"], "defs.report._sheet"),
+        refused(cards["sheet"], "defs.report._sheets"),
         refused(cards["gallery"], "defs.report._gallery"),
         refused(cards["shortcuts"], "defs.report._shortcuts"),
         refused(
@@ -114,7 +114,7 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     return [*calls, refused(made, "", error=AssertionError)]
 
 
-FILES = {"sheet": report._sheet, "gallery": report._gallery, "shortcuts": report._shortcuts}
+FILES = {"sheet": report._sheets, "gallery": report._gallery, "shortcuts": report._shortcuts}
 
 
 def may_be_made(workspace: Workspace, stage: str) -> Callable[[], None]:

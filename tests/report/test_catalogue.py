@@ -11,21 +11,21 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
+from tests.build.boards import board_of, board_row
 from tests.build.cells import row
+from tests.build.latex import latex_cells
 from tests.conftest import ROOT
-from tests.report.test_report import board_of, board_row
-from tests.report.test_writing import latex_cells
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.cli import main
-from traps_pipeline.judging.tables import JUDGE_BIAS, JUDGE_VALIDATION
+from traps_pipeline.judging.judging_rows import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES, workspace_files
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import Column, PrintedTable, figure_files, freeze_layout, table_files, table_latex
-from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD
+from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

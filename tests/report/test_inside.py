@@ -12,8 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS
-from traps_pipeline.mechanism.control_tables import (
+from traps_pipeline.mechanism.control_rows import (
     GATE,
     PATCHING,
     PROBE_BASELINES,
@@ -23,19 +22,20 @@ from traps_pipeline.mechanism.control_tables import (
 )
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.mechanism.effects import own_effects
-from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
+from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
 from traps_pipeline.report.page import Card, picture_block, report_html
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.results import Makers, Results
+from traps_pipeline.report.result_frames import Makers, Results
 from traps_pipeline.report.study_results import StudyResults
-from traps_pipeline.report.tables import inside
-from traps_pipeline.report.tables.mechanism import steering as steering_tables
-from traps_pipeline.report.tables.mechanism import why
-from traps_pipeline.report.tables.patching import patching as patching_table
+from traps_pipeline.report.tables import control_reports
+from traps_pipeline.report.tables.patching_tables import patching as patching_table
+from traps_pipeline.report.tables.steering_tables import steering as steering_tables
+from traps_pipeline.report.tables.steering_tables import why
 from traps_pipeline.report.writing import PrintedTable
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.study import Layers, MechanismSettings
 from traps_pipeline.storage.tables import Table
 
@@ -128,7 +128,7 @@ def cells(table: PrintedTable) -> list[dict[str, str]]:
 
 
 def test_probes_stand_beside_their_baselines_at_the_sources_own_layer() -> None:
-    beside, look_alikes = inside.probe_baselines(Made())
+    beside, look_alikes = control_reports.probe_baselines(Made())
     own, across = cells(beside)
     assert (own["Path"], own["Layer"], own["States"], own["from"]) == ("ch→ch", "3", "0.980", "0.790")
     assert (own["Time stamps"], own["Output margin"], own["Noise"]) == ("1.000", "0.900", "0.500 ± 0.100")
@@ -138,7 +138,7 @@ def test_probes_stand_beside_their_baselines_at_the_sources_own_layer() -> None:
 
 
 def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
-    sources, controls, answerable, _ = inside.gate(Made())
+    sources, controls, answerable, _ = control_reports.gate(Made())
     assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
     assert [(row["Controls"], row["Voids"]) for row in (*cells(sources), *cells(controls))] == [("64", "64")] * 4
     assert [(row["Features"], row["PECS, gated"]) for row in cells(controls)] == [
@@ -151,7 +151,7 @@ def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
 
 
 def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
-    table = inside.gate(Made())[-1]
+    table = control_reports.gate(Made())[-1]
     (row,) = cells(table)  # chaotic alone has answers, under guided; the output margin was read under standard
     assert (row["Dataset"], row["guided"], row["guided − standard"]) == ("ch", "50.0", "–")
     assert (row["Probe, standard"], row["Output margin, standard"]) == ("0.980", "0.900")
@@ -160,21 +160,21 @@ def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
     made = Made()
     made.made["prompted_probes"] = probes().assign(n_voids=9)
     made.made["gate"] = gate().assign(n_voids=9)
-    (few,) = cells(inside.gate(made)[-1])
+    (few,) = cells(control_reports.gate(made)[-1])
     assert (few["guided"], few["Probe, standard"], few["Output margin, standard"]) == ("50.0 †", "0.980 †", "0.900 †")
     assert row["Probe, guided"] == "0.960" and row["Output margin, guided"] == row["AbsRec %, standard"] == "–"
 
 
 def test_nulls_say_in_how_many_rows_a_direction_is_ahead() -> None:
-    first, _ = inside.steering_nulls(Made())
+    first, _ = control_reports.steering_nulls(Made())
     assert any("ahead of 19 of 20 draws in 1 of 1 rows" in note for note in first.notes)
-    assert inside._ahead(nulls().assign(n_at_least=2))[0].startswith(
+    assert control_reports._ahead(nulls().assign(n_at_least=2))[0].startswith(
         "the void direction is ahead of 19 of 20 draws nowhere"
     )
 
 
 def test_few_answers_are_marked_and_p_is_printed() -> None:
-    nulls, _ = inside.steering_nulls(Made())
+    nulls, _ = control_reports.steering_nulls(Made())
     (row,) = cells(nulls)
     assert (row["Effect, points"], row["p"], row["Draws"]) == ("80.0 †", "0.048", "20")
     assert any(note.startswith("†") for note in nulls.notes)
@@ -328,7 +328,7 @@ def steered() -> pd.DataFrame:
 def test_the_unsteered_model_is_one_row_a_path() -> None:
     made = Made()
     made.made["steering_pecs"] = steered()
-    _, table = inside.steering_nulls(made)
+    _, table = control_reports.steering_nulls(made)
     found = [(row["Signs"], row["Dose"]) for row in cells(table)]
     assert found[0] == ("not steered", "none") and len(found) == len(set(found)) == 5
 
@@ -337,16 +337,16 @@ def test_gates_on_states_at_the_mid_threshold_come_first() -> None:
     made, rows = Made(), gate()
     first = rows.loc[(rows["features"] == "states") & (rows["target"] != "decoy")]
     made.made["gate"] = pd.concat([rows.assign(features="length"), first.assign(threshold="J"), rows])
-    sources, controls, *_ = inside.gate(made)
+    sources, controls, *_ = control_reports.gate(made)
     assert [row["Threshold"] for row in cells(sources)] == ["mid", "mid", "J", "J"]
     assert [row["Target"] for row in cells(sources)][:2] == ["all", "ch"]
     made.made["gate"] = gate().assign(layer=-1)  # as the stage writes it of a mean over datasets
-    assert cells(inside.gate(made)[0])[0]["Layer"] == "–"
+    assert cells(control_reports.gate(made)[0])[0]["Layer"] == "–"
     assert cells(controls)[0]["Features"] == "states"
 
 
 def test_the_deviation_of_noise_is_not_said_to_be_over_runs() -> None:
-    for table in (*inside.probe_baselines(Made()), inside.gate(Made())[-1]):
+    for table in (*control_reports.probe_baselines(Made()), control_reports.gate(Made())[-1]):
         assert "± standard deviation over draws of noise" in table.remarks
         assert any("log-odds that the first answer token" in note for note in table.notes)
 

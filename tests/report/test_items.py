@@ -6,12 +6,12 @@ import pandas as pd
 import pytest
 
 from tests.build.cells import CELL, write_cell
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.report import items
-from traps_pipeline.report.items import addresses, index_page, item_pages, page_name, write_item_pages
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.report import cell_pages
+from traps_pipeline.report.cell_pages import addresses, index_page, item_pages, page_name, write_item_pages
 from traps_pipeline.report.writing import Behind
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -74,7 +74,7 @@ def test_a_page_is_made_anew_only_where_its_tables_changed(workspace, tmp_path):
 
 def test_a_large_cell_has_pages_that_lead_to_each_other_with_both_sides_on_each(workspace, tmp_path, monkeypatch):
     """Five pairs, two a page: the sides' anchors stand on the first page, and no item is lost or shown twice."""
-    monkeypatch.setattr(items, "PER_PAGE", 2)
+    monkeypatch.setattr(cell_pages, "PER_PAGE", 2)
     write_cell(workspace)
     for table, part in ((ITEMS, {"dataset": "chaotic"}), *((t, CELL.partition) for t in (RESPONSES, VOTES, VERDICTS))):
         rows, copies = workspace.tables.read(table, part), []

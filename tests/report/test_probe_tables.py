@@ -8,12 +8,12 @@ from typing import ClassVar
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import ANSWERABLE
-from traps_pipeline.mechanism.control_tables import PROBE_BASELINES
-from traps_pipeline.mechanism.tables import PROBES
+from traps_pipeline.mechanism.control_rows import PROBE_BASELINES
+from traps_pipeline.mechanism.mechanism_rows import PROBES
+from traps_pipeline.protocol.datasets import ANSWERABLE
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.results import Makers, Results
-from traps_pipeline.report.tables.probes import probes
+from traps_pipeline.report.result_frames import Makers, Results
+from traps_pipeline.report.tables.probe_tables import probes
 from traps_pipeline.report.writing import PrintedTable
 from traps_pipeline.storage.tables import Table
 

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import io
 import re
-from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS, REGIMES, SHORT
+from tests.build.boards import board_of, board_row, tables
+from tests.build.errors import raises
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs, telling_times
-from traps_pipeline.report.figures.labels import Label, merged_labels
+from traps_pipeline.report.figures.label_placement import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
-from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
+from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
-from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.worked_example import chosen_example, example_figure, reading
 from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
 from traps_pipeline.scenes.picture.encode import encode
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
 
-NO_BREAK = "\u2011"  # a hyphen at which no line ends
 HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"
 REFERENCES = {  # Acc, FalseAbs, AbsRec
     "oracle": (1, 0, 1),
@@ -37,38 +37,6 @@ REFERENCES = {  # Acc, FalseAbs, AbsRec
     "confidence-noise": (0.7, 0.3, 0.3),
     "prior": (0.41, 0, 0),
 }
-
-
-def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6), **other):
-    """One LEADERBOARD row with these Acc, FalseAbs and AbsRec."""
-    acc, false_abs, abs_rec = shares
-    j = abs_rec - false_abs
-    pecs = acc * max(0.0, j)
-    figures = {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": j, "pecs": pecs}
-    row = {
-        **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
-        **{name: float(value) for name, value in figures.items()},
-        **{f"{name}_std": 0.01 for name in figures},
-        **dict.fromkeys(("n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate", "n_unread"), 0),
-        **dict.fromkeys(("n_not_json", "n_errors"), 0),
-        **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
-        **{f"{name}_ci_{end}": float(value) for name, value in figures.items() for end in ("low", "high")},
-        **{
-            "rank": 1,
-            "rank_low": 1,
-            "rank_high": 2,
-            "pecs_low": pecs,
-            "pecs_high": pecs,
-            "naive": acc * abs_rec,
-            "epoch": "e1",
-            "benchmark_version": "v1",
-        },
-    }
-    return {**row, **other}
-
-
-def board_of(*rows):
-    return pd.DataFrame(list(rows))[LEADERBOARD.names]
 
 
 @pytest.fixture(scope="module")
@@ -121,51 +89,6 @@ def test_missing_items_are_marked_wherever_the_model_stands():
         assert [row["Missing"] for row in table if row["Model"] == "gaps"] == ["7 †"]
         assert [row["Missing"] for row in table if row["Model"] == "whole"] == ["0"]
     assert "†" not in leaderboard_text(board_of(board_row("whole")))
-
-
-class Rows(HTMLParser):
-    """The cells' texts of every table row of a page."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.rows, self.inside = [], False
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        if tag == "tr":
-            self.rows.append([])
-        elif tag in ("td", "th"):
-            self.rows[-1].append("")
-            self.inside = True
-
-    def handle_endtag(self, tag):
-        self.inside = self.inside and tag not in ("td", "th")
-
-    def handle_data(self, data):
-        if self.inside:
-            self.rows[-1][-1] += data
-
-
-def tables(board):
-    """Header and rows of the ranked table in a terminal, in Markdown and in HTML, each row by heading, without the
-    columns that HTML alone has or names otherwise."""
-    text = [re.split(r"\s{2,}", line.strip()) for line in leaderboard_text(board).split("\n\n")[1].splitlines()]
-    lines = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
-    markdown = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in [lines[0], *lines[2:]]]
-    html = [[" ".join(cell.split()) for cell in row] for row in Rows(report_html(board)).rows[: len(text)]]
-    return [by_heading(rows) for rows in (text, markdown, html)]
-
-
-def by_heading(rows):
-    """Rows as mappings, without deviations, bars and escapes."""
-    names = {f"PECS {TITLES[name].replace('-', NO_BREAK)}": f"PECS {short}" for name, short in SHORT.items()}
-    headings = [names.get(heading, heading).replace("\\", "") for heading in rows[0]]
-    found = []
-    for row in rows[1:]:
-        cells = [re.sub(r" ± [\d.]+", "", cell.replace("\\", "")) for cell in row]
-        cells = dict(zip(headings, cells, strict=False))  # a terminal's line ends before what is empty at its end
-        found.append({name: cell for name, cell in cells.items() if name not in ("", "Runs") and cell})
-    return found
 
 
 def cells_with_gaps(model="gaps"):
@@ -419,7 +342,7 @@ def test_a_contact_sheet_takes_the_first_pairs_of_each_sub_scenario(tmp_path):
     items = pd.DataFrame(rows)
     assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, 1)] == ["dice-0", "plinko-0"]
     assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, None)] == ["dice-0", "plinko-0", "plinko-1"]
-    with pytest.raises(ValueError, match="1 to 80 pairs, not 0"):
+    with raises(ValueError, "report.contact_sheet.chosen_pairs", "80"):
         chosen_pairs(items[items["side"] == "control"], 1)
 
 

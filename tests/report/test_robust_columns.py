@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from tests.build.boards import board_of, board_row, tables
 from tests.build.cells import row
-from tests.report.test_report import board_of, board_row, tables
-from traps_pipeline.base.partitions import ARMS, DATASETS
-from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
-from traps_pipeline.scoring.tables import ROBUST
+from traps_pipeline.scoring.score_rows import ROBUST
 
 BOARD = board_of(*(board_row(model, dataset=d) for model in ("asked", "alone") for d in ("overall", *DATASETS)))
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from tests.build.latex import latex_cells
 from traps_pipeline.report.writing import (
     Behind,
     Column,
@@ -45,15 +46,6 @@ def table(**other):
         }
     )
     return PrintedTable("results", "Results & more", rows, COLUMNS, ["epoch e1"], **other)
-
-
-def latex_cells(text):
-    """Cells of the body rows of a booktabs table, split at unescaped ampersands; a table that breaks over pages has
-    heads and feet for its further pages."""
-    further, last = r"\endfoot", r"\endlastfoot"
-    rows = text.split(last)[1] if last in text else text.split(further)[-1].split(r"\midrule")[1]
-    body = rows.split(r"\bottomrule")[0].split(r"\end{longtable}")[0].strip().splitlines()
-    return [re.split(r"(?<!\\)&", line.removesuffix(r"\\")) for line in body]
 
 
 def test_cells_are_printed_in_their_units_with_spread_and_mark():

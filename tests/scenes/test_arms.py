@@ -10,8 +10,8 @@ import pytest
 
 from tests.scenes import arm_table
 from tests.scenes.released import load
-from traps_pipeline.base.partitions import ARMS, arms_of, sides_of
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.protocol.datasets import ARMS, arms_of, sides_of
 from traps_pipeline.scenes.parts.offers import with_choices, without_choices
 from traps_pipeline.scenes.parts.wording import refutation
 from traps_pipeline.scenes.picture.camera import Panel

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.build.errors import raises
 from tests.scenes.released import load
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
@@ -52,17 +53,17 @@ def test_a_look_is_read_back_from_a_record_and_one_that_is_not_there_leaves_none
 
 
 @pytest.mark.parametrize(
-    ("look", "said"),
+    "look",
     [
-        ({"floor_tones": ["chalk", "gold"]}, "no tone 'gold'; there are chalk"),
-        ({"panel": "pink"}, "no panel 'pink'; there are navy"),
-        ({"material": "felt"}, "no material 'felt'; there are plain"),
-        ({"size": "4k"}, "no size '4k'; there are 360p, 720p"),
-        ({"fog": 1.0}, "look: .*'fog'"),
+        {"floor_tones": ["chalk", "gold"]},
+        {"panel": "pink"},
+        {"material": "felt"},
+        {"size": "4k"},
+        {"fog": 1.0},
     ],
 )
-def test_a_look_that_does_not_exist_is_refused_by_name(look: dict[str, object], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_a_look_that_does_not_exist_is_refused_by_name(look: dict[str, object]) -> None:
+    with raises(ValueError, "scenes.parts.look.Look.from_record"):
         get_family("bounce").params_from(load("bounce-0001").spec.params | {"look": look})
 
 

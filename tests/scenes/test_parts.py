@@ -8,6 +8,7 @@ from dataclasses import dataclass, make_dataclass
 import numpy as np
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.scenes.parts import floor, observers, questions, vary, vision
 from traps_pipeline.scenes.parts import readings as outcome
 from traps_pipeline.scenes.parts.board import Board
@@ -72,11 +73,11 @@ def test_the_hidden_element_is_as_likely_whatever_is_seen() -> None:
 
 def test_params_that_cannot_be_drawn_are_named() -> None:
     two = make_dataclass("Two", [("a", bool, vary.hidden(False, True)), ("b", bool, vary.hidden(False, True))])
-    with pytest.raises(TypeError, match=r"several hidden elements \['a', 'b'\]"):
+    with raises(TypeError, "scenes.parts.vary.hidden_field"):
         vary.hidden_field(two)
-    with pytest.raises(TypeError, match=r"Params\.speed has no range"):
+    with raises(TypeError, "scenes.parts.vary.drawn", "speed"):
         vary.drawn(make_dataclass("Bare", [("speed", float)]), np.random.default_rng(0))
-    with pytest.raises(TypeError, match="there are no twins"):
+    with raises(TypeError, "scenes.parts.vary.twins"):
         vary.twins(make_dataclass("Seen", [("speed", float, vary.between(0, 1))])(0.5))
 
 
@@ -290,7 +291,7 @@ def test_planks_have_joints_of_the_second_tone_and_an_unknown_floor_is_refused()
     planks = floor._shares("planks")
     assert (planks == 1).mean() == pytest.approx(0.075, abs=0.02)  # 6 % between planks, 1.6 % at their ends
     assert planks.min() == 0.0
-    with pytest.raises(ValueError, match="no floor pattern 'sea'; there are plain, checks"):
+    with raises(ValueError, "scenes.parts.floor._shares", "sea", "checks"):
         floor._shares("sea")
 
 

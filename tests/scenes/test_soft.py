@@ -11,10 +11,10 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.scenes.released import SAMPLED, load
-from traps_pipeline.base.partitions import EXTENSION_CATEGORIES
 from traps_pipeline.base.paths import OWN_SPECS
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.certification.certificates import HIDDEN, SAME_START_M, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.family_registry import get_family

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.scenes.parts.wording import (
     BEYOND_VIDEO,
     beyond_video,
@@ -95,7 +96,7 @@ def test_a_colour_that_is_nearly_there_refutes_nothing() -> None:
 
 
 def test_a_scene_with_every_question_taken_is_refused() -> None:
-    with pytest.raises(ValueError, match="name more things"):
+    with raises(ValueError, "scenes.parts.wording.draw_ill_posed"):
         draw_ill_posed("occlusion", SCENE, np.random.default_rng(0), lambda _: False)
 
 

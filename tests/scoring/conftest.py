@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 
 Flag = bool | None
 Pair = tuple[Flag, Flag, Flag]  # correct on control, abstained on control, abstained on void

@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS
+from tests.build.errors import raises
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
     degenerate_strategies,
@@ -79,9 +80,7 @@ def test_a_mean_of_which_a_dataset_has_no_figure_is_null_and_so_is_what_is_made_
 
 def test_a_ratio_across_epochs_is_refused_and_names_model_dataset_and_epochs():
     frame = cells(cell(), cell(regime="guided", epoch="e2"))
-    with pytest.raises(
-        EpochMismatch, match=r"uplift: m/occlusion has guided from epoch 'e2', standard from epoch 'e1'"
-    ):
+    with raises(EpochMismatch, "scoring.epochs.require_one_epoch", "uplift", "m/occlusion"):
         uplift(frame)
 
 
@@ -92,7 +91,7 @@ def test_a_mean_may_mix_epochs_where_both_sides_mix_them_alike():
 
 def test_the_papers_own_chaotic_gap_is_refused_and_its_occlusion_gap_is_not():
     frame = published_cells()
-    with pytest.raises(EpochMismatch, match="chaotic has textual from epoch 'original', visual from epoch 'corrected'"):
+    with raises(EpochMismatch, "scoring.epochs.require_one_epoch", "chaotic"):
         visual_textual_gap(frame)
     gaps = visual_textual_gap(frame, ["occlusion"]).set_index(["model", "regime"])
     rows = published("behavioral_per_dataset").set_index(["model", "regime", "dataset"])["abs_rec_pct"]
@@ -245,5 +244,5 @@ def test_hidden_sub_scenarios_against_the_others_as_published():
 
 
 def test_a_cell_given_twice_is_an_error():
-    with pytest.raises(ValueError, match="two rows for m, occlusion, standard"):
+    with raises(ValueError, "scoring.analyses._checked", "occlusion", "standard"):
         overall(cells(cell(), cell()))

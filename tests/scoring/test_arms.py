@@ -2,60 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.cells import row
-from traps_pipeline.base.partitions import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
-from traps_pipeline.benchmark.tables import ITEMS
+from tests.build.verdicts import JUDGES, Rows, of_arm, write
 from traps_pipeline.defs import judging, scoring
 from traps_pipeline.judging.ratings import VOTE_COLUMNS
-from traps_pipeline.judging.tables import VERDICTS, VOTES
-from traps_pipeline.judging.verdicts import current
-from traps_pipeline.models.judges import panel_id
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
-from traps_pipeline.scoring.tables import CONTRASTS, METRICS
+from traps_pipeline.scoring.score_rows import CONTRASTS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
-Rows = Callable[..., pd.DataFrame]
 MODELS = {"oracle": (True, False, True), "prior": (True, True, False)}
-JUDGES = ("rule-1", "rule-2", "rule-3")
-
-
-def of_arm(rows: Rows, arm: str, pairs: list[tuple[bool, bool, bool]], **cell: object) -> pd.DataFrame:
-    """VERDICTS rows of an arm: of the sides that it has."""
-    both = rows(pairs, dataset=arm, **cell)
-    sides = ["control"] * (arm not in VOID_ARMS) + ["void"] * (arm not in ANSWERABLE_ARMS)
-    return both.loc[both["side"].isin(sides)].reset_index(drop=True)
-
-
-def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:
-    """Items, votes, verdicts and metrics of these VERDICTS rows, as their stages would leave them."""
-    tables = workspace.tables
-    for dataset, part in verdicts.groupby("dataset"):
-        named = part.drop_duplicates("item_id")[["item_id", "pair_id", "side"]].to_dict("records")
-        tables.write(ITEMS, {"dataset": dataset}, [row(ITEMS, dataset=dataset, **item) for item in named], {})
-        for cell, mine in part.groupby(["dataset", "model", "regime", "run"]):
-            where = dict(zip(("dataset", "model", "regime", "run"), cell, strict=True))
-            tables.write(VERDICTS, where, mine.reset_index(drop=True), {})
-            cast = [
-                row(VOTES, item_id=item, side=side, task="abstention", judge=judge, valid=True, panel=panel_id("rules"),
-                    abstained=bool(said) != (judge == JUDGES[0] and dataset in ARMS), **where)
-                for item, side, said in mine[["item_id", "side", "abstained"]].itertuples(index=False)
-                for judge in JUDGES
-            ]  # fmt: skip
-            tables.write(VOTES, where, cast, {})
-        tables.write(
-            METRICS, {"dataset": dataset}, cell_metrics(current(workspace, VERDICTS, dataset=str(dataset))), {}
-        )
 
 
 def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from statsmodels.stats.proportion import proportion_confint
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, draw_scenarios, intervals, resample
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import ARMS, BESIDE, DATASETS, VARIATIONS, sides_of
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.hypotheses import hypotheses as printed
-from traps_pipeline.scoring.hypotheses import DATASETS_READ, HYPOTHESES, hypotheses, wrong_rows
+from traps_pipeline.protocol.datasets import ARMS, BESIDE, DATASETS, VARIATIONS, sides_of
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.hypothesis_tables import hypotheses as printed
+from traps_pipeline.scoring.doses import DATASETS_READ, HYPOTHESES, hypotheses, wrong_rows
 
 Rows = Callable[..., pd.DataFrame]
 

@@ -10,10 +10,10 @@ import pytest
 
 from tests.judging.conftest import vote_rows
 from traps_pipeline.judging.verdicts import decide
-from traps_pipeline.scoring.leaderboard import standings
 from traps_pipeline.scoring.leave_one_out import leave_one_out, two_judge_verdicts
 from traps_pipeline.scoring.metrics import cell_metrics
-from traps_pipeline.scoring.tables import LEAVE_ONE_OUT
+from traps_pipeline.scoring.score_rows import LEAVE_ONE_OUT
+from traps_pipeline.scoring.standings import standings
 from traps_pipeline.storage.parquet import TableStore
 
 TASKS = ("correctness", "control_abstention", "void_abstention")

@@ -11,11 +11,11 @@ import pandas as pd
 import pytest
 from sklearn.metrics import confusion_matrix
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
-from traps_pipeline.judging.people_tables import HUMAN_LABELS
+from traps_pipeline.judging.human_label_rows import HUMAN_LABELS
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import RESAMPLED, intervals, resample
 from traps_pipeline.scoring.corrected import NO_BETTER, corrected, panel_errors, rogan_gladen
-from traps_pipeline.scoring.people import human_row
+from traps_pipeline.scoring.human_scores import human_row
 
 Rows = Callable[..., pd.DataFrame]
 

@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.base.partitions import DATASETS
+from tests.build.errors import raises
 from traps_pipeline.cli import main
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.power import Shares, precision
 
@@ -25,7 +26,7 @@ def test_the_width_of_one_dataset_follows_by_hand() -> None:
     assert 2 * 1.96 * 0.0125 < found.width < 2 * 1.96 * 0.0125 + 2 * 1.5 * 0.5 / 801 + 0.002
     assert found.difference is not None and found.difference > 2.8016 * 0.017678
     assert precision({"occlusion": 800, "chaotic": 0}).width == precision({"occlusion": 800}).width
-    with pytest.raises(ValueError, match="no dataset"):
+    with raises(ValueError, "scoring.power.precision"):
         precision({"occlusion": 0})
 
 

@@ -10,13 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.scoring.test_arms import of_arm, write
+from tests.build.errors import raises
+from tests.build.verdicts import of_arm, write
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs import scoring
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.robust import robust, wrong_rows
-from traps_pipeline.scoring.tables import ROBUST
+from traps_pipeline.scoring.score_rows import ROBUST
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -164,7 +165,7 @@ def test_the_stage_writes_a_table_with_arms_and_an_empty_one_without(
     rows: Rows, tmp_path: Path, arms: dict[str, Pairs]
 ) -> None:
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
-    with pytest.raises(TrapsError, match="materialize verdicts"):
+    with raises(TrapsError, "defs.scoring._make_robust"):
         scoring._make_robust(workspace, None)
     write(workspace, study(rows, [RIGHT], arms))
     made = scoring._make_robust(workspace, None)

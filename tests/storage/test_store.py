@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.video_rows import clip
 from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
-from tests.storage.test_parquet import clip
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.cluster.bucket import object_name

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.storage.workspace import Workspace
@@ -55,7 +56,7 @@ def test_creating_it_again_opens_it_and_keeps_what_was_edited(tmp_path: Path) ->
 )
 def test_another_benchmark_or_subset_is_refused_with_the_remedy(tmp_path: Path, wanted: Study, field: str) -> None:
     Workspace.create(tmp_path, Study(per_family=2))
-    with pytest.raises(TrapsError, match=rf"study\.yaml: {field} is .*choose another folder with TRAPS_WORKSPACE"):
+    with raises(TrapsError, "storage.workspace.Workspace.create", "TRAPS_WORKSPACE"):
         Workspace.create(tmp_path, wanted)
 
 
@@ -63,7 +64,7 @@ def test_another_benchmark_or_subset_is_refused_with_the_remedy(tmp_path: Path, 
 def test_a_workspace_of_another_format_is_refused_with_the_remedy(tmp_path: Path, other: int | None) -> None:
     Workspace.create(tmp_path, Study())
     edit(tmp_path, format=other)
-    with pytest.raises(TrapsError, match=rf"study\.yaml: workspace format {other}, .*reads {FORMAT}; .*start a new"):
+    with raises(TrapsError, "storage.workspace.Workspace.open", "study.yaml"):
         Workspace.open(tmp_path)
 
 
@@ -85,7 +86,7 @@ def test_a_malformed_study_names_its_file_and_the_field(tmp_path: Path, text: by
 
 
 def test_a_folder_without_a_study_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(TrapsError, match=r"study\.yaml: no such workspace; make one with `traps init`"):
+    with raises(TrapsError, "storage.workspace.Workspace.open", "study.yaml"):
         Workspace.open(tmp_path)
 
 

@@ -17,7 +17,7 @@ from tests.build.ledger import answer, write
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.cli import main
 from traps_pipeline.scenes.picture.encode import encode
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.storage.study import Study

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
+from tests.build.errors import raises
 from traps_pipeline.study.exchange import _ERROR_TEXT, Answer
 
 
@@ -32,5 +33,5 @@ def test_a_line_without_an_outcome_has_the_one_of_its_finish_reason() -> None:
     assert Answer(key="k", text="left", finish_reason="length").outcome == "truncated"
     assert Answer(key="k", text="left", finish_reason="of_the_weather").outcome == "unfinished"
     assert Answer(key="k", text="left").outcome == "answer"
-    with pytest.raises(ValidationError, match="an error is no answer"):
+    with raises(ValidationError, "Answer"):
         Answer(key="k", text="left", finish_reason="abort")

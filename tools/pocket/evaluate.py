@@ -15,11 +15,11 @@ from tools.pocket.data import SceneRecord, read_shards
 from tools.pocket.recipe import Recipe
 from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import REGIMES
-from traps_pipeline.judging.answers import is_correct
+from traps_pipeline.judging.judged_answers import is_correct
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.metrics import wilson
 from traps_pipeline.storage.media import sample
 

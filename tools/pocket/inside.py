@@ -13,11 +13,11 @@ from tools.pocket.evaluate import MODEL
 from tools.pocket.planted import TRUTHS, planted
 from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ANSWERABLE, transfer_type
-from traps_pipeline.mechanism.paths import TRANSFER_TYPES
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.mechanism.shares import ALL
-from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
+from traps_pipeline.mechanism.transfer_paths import TRANSFER_TYPES
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
+from traps_pipeline.protocol.datasets import ANSWERABLE, transfer_type
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights

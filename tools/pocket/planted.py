@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS
-from traps_pipeline.judging.tables import VERDICTS
-from traps_pipeline.mechanism.control_tables import GATE, PATCHING, PROBE_BASELINES, STEERING_NULLS
-from traps_pipeline.mechanism.tables import PROBES
+from traps_pipeline.judging.judging_rows import VERDICTS
+from traps_pipeline.mechanism.control_rows import GATE, PATCHING, PROBE_BASELINES, STEERING_NULLS
+from traps_pipeline.mechanism.mechanism_rows import PROBES
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
 DECOY = "decoy"

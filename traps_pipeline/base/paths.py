@@ -25,6 +25,11 @@ CORRECTIONS = SCENE_SPECS / "corrections"
 WORKSPACES = (Path.cwd() if IS_INSTALLED else ROOT) / ".workspaces"
 
 
+def user_cache() -> Path:
+    """Return the folder of this user for what can be made again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "traps"
+
+
 def require_root() -> Path:
     """The folder that holds `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is missing."""
     for folder in (ASSETS, SCENE_SPECS):

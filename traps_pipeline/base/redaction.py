@@ -56,7 +56,11 @@ def remember(value: str) -> None:
 
 def redact(text: str) -> str:
     """Return the text with each secret in it replaced by `***`, known or recognizable by its header."""
-    needles, spans = _needles(frozenset(_secrets())), list[tuple[int, int]]()
+    if len(text) < SHORTEST:  # most cells of a table
+        return text
+    environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
+    secrets = _secrets(environment, frozenset(_variables), frozenset(_values))
+    needles, spans = _needles(secrets), list[tuple[int, int]]()
     for is_decoded in (False, True) if _ENCODED.search(text) else (False,):
         searched = _searched(text, is_decoded)
         if any(needle[:_HEAD] in searched for needle in needles):
@@ -101,19 +105,19 @@ def redacted(error: Exception) -> Exception:
     return error if without == shown else RuntimeError(without).with_traceback(error.__traceback__)
 
 
-def _secrets() -> Iterator[str]:
-    yield from _values
-    for name, value in os.environ.items():
+@lru_cache(maxsize=8)
+def _secrets(
+    environment: frozenset[tuple[bytes, bytes]], variables: frozenset[str], values: frozenset[str]
+) -> frozenset[str]:
+    secrets = {*values}
+    for name, value in ((os.fsdecode(name), os.fsdecode(value)) for name, value in environment):
         is_address = "://" in value or "password=" in value
-        if not is_address and (name in _variables or _NAMES.search(name)):
-            yield value
+        if not is_address and (name in variables or _NAMES.search(name)):
+            secrets.add(value)
         if is_address:
-            yield from (
-                group
-                for match in _PASSWORD.finditer(value)
-                for group in match.groups()
-                if group not in (None, _EXAMPLE)
-            )
+            groups = (group for match in _PASSWORD.finditer(value) for group in match.groups())
+            secrets |= {group for group in groups if group not in (None, _EXAMPLE)}
+    return frozenset(secrets)
 
 
 @lru_cache(maxsize=64)

@@ -25,10 +25,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study

@@ -15,13 +15,13 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.base.partitions import ARMS as ARM_NAMES
-from traps_pipeline.base.partitions import beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
+from traps_pipeline.protocol.datasets import beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
@@ -159,7 +159,7 @@ def _files(clip: Path) -> tuple[Path, ...]:
 @cache
 def _code(arm: str) -> str:
     """The code that films an arm or a variation: after a change of it, it is filmed anew."""
-    names = ("arms.py", "offers.py") if arm in ARM_NAMES else ("variations.py",)
+    names = ("variants/arms.py", "parts/offers.py") if arm in ARM_NAMES else ("variants/variations.py",)
     return digest([file_digest(PACKAGE / "scenes" / name) for name in names])
 
 

@@ -10,9 +10,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.base.paths import RELEASED, SCENE_SPECS
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_lines, read_yaml
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 

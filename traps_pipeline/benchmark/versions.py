@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.base.partitions import is_ill_posed
 from traps_pipeline.benchmark.records import load_release
+from traps_pipeline.protocol.datasets import is_ill_posed
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 

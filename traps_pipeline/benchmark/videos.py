@@ -16,6 +16,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.picture.encode import DamagedClip
+from traps_pipeline.scenes.worlds.clip_cache import ClipCache
 from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, render_pair
 from traps_pipeline.storage.workspace import Workspace
 
@@ -32,12 +33,29 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
         there = workspace.store.there(file for row in rows for file in _files(workspace, row))
         return [row for row in rows if not there.issuperset(_files(workspace, row))]
 
+    rendered = ClipCache.of_user()
+
+    def is_here(clip: Path, row: Row) -> bool:
+        return read_clip(clip) is not None or (rendered is not None and rendered.bring(clip, row["scene_hash"]))
+
     def job(row: Row) -> Job | None:
-        return None if all(map(read_clip, _clips(workspace, row))) else _job(workspace, row)
+        here = [is_here(clip, row) for clip in _clips(workspace, row)]
+        return None if all(here) else _job(workspace, row)
 
     tick = partial(_tick, category, len(specs))
-    rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, render_pair)
-    return share(workspace.store, specs, rendering, tick, wait=wait)
+    rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, _render)
+    drawn, is_whole = share(workspace.store, specs, rendering, tick, wait=wait)
+    if drawn and rendered is not None:
+        rendered.trim()
+    return drawn, is_whole
+
+
+def _render(job: Job) -> int:
+    """Render what is missing of a pair and its twin, and keep it for other studies; return the number of frames."""
+    drawn, rendered = render_pair(job), ClipCache.of_user()
+    if rendered is not None:
+        rendered.keep(job.clips, job.spec.scene_hash)
+    return drawn
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:

@@ -51,7 +51,7 @@ def export_results(arguments: argparse.Namespace) -> int:
 
 def compare_studies(arguments: argparse.Namespace) -> int:
     """See `traps compare --help`."""
-    from traps_pipeline.judging.tables import VERDICTS
+    from traps_pipeline.judging.judging_rows import VERDICTS
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
     from traps_pipeline.storage.workspace import Workspace

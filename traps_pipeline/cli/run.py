@@ -200,10 +200,10 @@ def _check_participant(name: str) -> None:
 
 
 def _print_results(workspace: Workspace) -> None:
-    from traps_pipeline.report.leaderboard import leaderboard_text
-    from traps_pipeline.report.tables.people import said_by_people
-    from traps_pipeline.scoring.people_tables import HUMAN_ROW, PANEL_ERRORS
-    from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
+    from traps_pipeline.report.leaderboard_page import leaderboard_text
+    from traps_pipeline.report.tables.human_tables import said_by_people
+    from traps_pipeline.scoring.human_score_rows import HUMAN_ROW, PANEL_ERRORS
+    from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 
     said = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
     print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST), said))

@@ -69,7 +69,7 @@ def verify_file(path: Path, release: Path | None) -> int:
 def leaderboard(arguments: argparse.Namespace) -> int:
     """See `traps leaderboard --help`."""
     from traps_pipeline.release.submissions import PAGE, gather, write_board
-    from traps_pipeline.report.leaderboard import leaderboard_text
+    from traps_pipeline.report.leaderboard_page import leaderboard_text
 
     given = arguments.submissions
     paths = [path for one in given for path in (sorted(one.glob("*.zip")) if one.is_dir() else [one])]

@@ -8,12 +8,12 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 from traps_pipeline.base.cores import CORES
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.cluster.same_code import CODE, code_here
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.ranges import Range
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
 STUDY_TAG = "traps/study"

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from traps_pipeline.base.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
@@ -13,6 +12,7 @@ from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check, Shared, Takes
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.orchestration.stage import is_declared, of, source, stage
+from traps_pipeline.protocol.datasets import all_datasets_of, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -3,11 +3,10 @@
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs.benchmark import items
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.judging.panel import collect_votes
-from traps_pipeline.judging.tables import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.answers import collect_answers
 from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
@@ -19,6 +18,7 @@ from traps_pipeline.orchestration.graph import Check, Collect
 from traps_pipeline.orchestration.previews import Records, StudyFile
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.orchestration.stage import of, source, stage
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -71,7 +71,7 @@ def _with_items(workspace: Workspace, cells: Iterator[tuple[Cell, Made]]) -> Ite
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
     """Metadata about a cell's items: a table of those without an answer, and the page of all."""
-    from traps_pipeline.report.items import FOLDER, page_name
+    from traps_pipeline.report.cell_pages import FOLDER, page_name
 
     page = workspace.reports / FOLDER / page_name(cell)
     columns = ("item_id", "side", "outcome", "error", "attempts")

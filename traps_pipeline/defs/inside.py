@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import DATASETS, PROBE_PROMPT, PROBED_ARMS, Cell, Evaluation, Extraction
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.mechanism import (
     ANSWERED,
@@ -15,7 +14,7 @@ from traps_pipeline.defs.mechanism import (
     steers,
 )
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.mechanism.control_tables import (
+from traps_pipeline.mechanism.control_rows import (
     GATE,
     PATCHING,
     PROBE_BASELINES,
@@ -23,13 +22,16 @@ from traps_pipeline.mechanism.control_tables import (
     STEERING_NULLS,
     STEERING_PECS,
 )
-from traps_pipeline.mechanism.tables import STEERING_EFFECTS
-from traps_pipeline.mechanism.versions import patching_version
+from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
+from traps_pipeline.mechanism.probing_versions import patching_version
 from traps_pipeline.models.registry import ModelEntry, local_models
 from traps_pipeline.orchestration.partitioning import EVERY, SAME
 from traps_pipeline.orchestration.schemes import CELL, EXTRACTION, by_extraction, these_keys
 from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -99,12 +101,11 @@ def _gated(wanted: Wanted, key: str) -> bool:
     """Whether the model of an extraction is asked, so that there are answers to gate."""
     extraction = Extraction.parse(key)
     asked = {(e.model, e.regime) for e in wanted.evaluations}
-    return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in asked for r in _REGIMES)
+    return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in asked for r in PROMPTING)
 
 
-_REGIMES = ("standard", "guided")
 _ASKED = (*DATASETS, *PROBED_ARMS)
-_GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in _REGIMES])
+_GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in PROMPTING])
 _OF_GATE = [
     of(hidden_states, by_extraction, need="some"),
     of(probe_items, EVERY),

@@ -8,11 +8,11 @@ from traps_pipeline.defs.evaluation import MAX_INVALID_SHARE, judges, responses,
 from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
-from traps_pipeline.judging.tables import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
+from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CELL, these_keys
 from traps_pipeline.orchestration.stage import of, source, stage
-from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
+from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -3,22 +3,11 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import (
-    ANSWERABLE,
-    DATASETS,
-    TIME_SWAPPED,
-    Cell,
-    Evaluation,
-    Extraction,
-    StatesCell,
-    SteeringCell,
-    taxonomy_of_category,
-)
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.mechanism.tables import (
+from traps_pipeline.mechanism.mechanism_rows import (
     COSINES,
     DIRECTIONS,
     HIDDEN_STATES,
@@ -29,8 +18,8 @@ from traps_pipeline.mechanism.tables import (
     STEERING_VOTES,
     ProbeRow,
 )
-from traps_pipeline.mechanism.tables import STEERING as STEERING_TABLE
-from traps_pipeline.mechanism.versions import (
+from traps_pipeline.mechanism.mechanism_rows import STEERING as STEERING_TABLE
+from traps_pipeline.mechanism.probing_versions import (
     directions_are_there,
     extraction_version,
     probing_version,
@@ -57,6 +46,8 @@ from traps_pipeline.orchestration.schemes import (
 )
 from traps_pipeline.orchestration.stage import of, source, stage
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

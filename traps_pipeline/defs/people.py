@@ -2,15 +2,15 @@
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, responses, verdicts
 from traps_pipeline.defs.judging import confabulation
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.orchestration.stage import of, source, stage
-from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.scoring.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -63,7 +63,7 @@ def _make_agreement(workspace: Workspace, _: None) -> Made:
 
 def _make_row(workspace: Workspace, _: None) -> Made:
     """Acc, AbsRec, FalseAbs and PECS of people with intervals, their agreement, and the seconds that a clip takes."""
-    from traps_pipeline.scoring.people import human_row
+    from traps_pipeline.scoring.human_scores import human_row
 
     return _shown("people", human_row(workspace.tables.read(HUMAN_LABELS, {})))
 

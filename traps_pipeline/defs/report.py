@@ -1,10 +1,9 @@
 """The report group: contact sheet, gallery, the catalogue's tables and figures, the report page."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
@@ -12,13 +11,18 @@ from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.pieces import Files, Piece, make_pieces
 from traps_pipeline.orchestration.previews import Markdown
 from traps_pipeline.orchestration.stage import code_of, is_declared, of, source, stage
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.catalogue import FIGURES, TABLES, Report, workspace_files
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 GROUP = "report"
+SHOWN = 12  # names of pieces in an event
 READ = (judging, people, mechanism, inside, scoring)  # declared before this group, which reads their tables
 published = source(
     "published",
@@ -46,6 +50,25 @@ def _report(
     return _stage(name, made, doc, deps, kinds)
 
 
+def _in_pieces(
+    name: str,
+    pieces: Callable[[Workspace], Sequence[Piece]],
+    doc: str,
+    *,
+    deps: Sequence[str],
+    kinds: Sequence[str] = ("png",),
+    previewed: Sequence[str] = (),
+) -> Stage:
+    """An asset of many files, each made again only when what it is made from changed."""
+
+    def made(workspace: Workspace, _: None) -> Made:
+        files, remade = make_pieces(workspace, name, code_of(GROUP), pieces(workspace))
+        shown = {"made again": f"{len(remade)} of {len(files)}: {', '.join(remade[:SHOWN]) or 'none'}"}
+        return Made(files, shown=shown | _previews(files, [file for file in previewed if file in files]))
+
+    return _stage(name, made, doc, deps, kinds)
+
+
 def _stage(
     name: str, made: Callable[[Workspace, Any], Made], doc: str, deps: Sequence[str], kinds: Sequence[str]
 ) -> Stage:
@@ -61,9 +84,16 @@ def _previews(files: Mapping[str, bytes], names: Sequence[str]) -> dict[str, Any
     return pictures | texts
 
 
-def _sheet(workspace: Workspace) -> Files:
+def _looked_at(rows: "pd.DataFrame") -> str:
+    """Rows as JSON, without the benchmark's version, which a correction changes in rows that it does not touch."""
+    return str(rows.drop(columns=["benchmark_version"]).to_json(orient="records"))
+
+
+def _sheets(workspace: Workspace) -> list[Piece]:
+    import pandas as pd
+
     from traps_pipeline.report.arms_sheet import arms_sheets
-    from traps_pipeline.report.contact_sheet import PAGE, contact_sheet, pairs_figure, six_pairs
+    from traps_pipeline.report.contact_sheet import PAGE, chosen_pairs, contact_sheet, pairs_figure, six_pairs
     from traps_pipeline.report.writing import figure_bytes
 
     rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
@@ -71,25 +101,38 @@ def _sheet(workspace: Workspace) -> Files:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
     arms = workspace.tables.read_all(ARMS)
     root = workspace.bring([*rows["clip"], *arms["clip"].dropna()])
-    six = pairs_figure(six_pairs(rows), root, None, 3, PAGE)
-    sheets = {"contact_sheet.png": contact_sheet(rows, root), "six_pairs.png": figure_bytes(six)}
-    return sheets | arms_sheets(rows, arms, root)
+    first, six = pd.concat(chosen_pairs(rows, 1)).reset_index(), six_pairs(rows)
+    visual = _looked_at(rows.loc[rows["dataset"].isin(["occlusion", "chaotic"])]) if len(arms) else ""
+    return [
+        Piece("first pairs", lambda: {"contact_sheet.png": contact_sheet(rows, root)}, inputs=_looked_at(first)),
+        Piece(
+            "six pairs",
+            lambda: {"six_pairs.png": figure_bytes(pairs_figure(six, root, None, 3, PAGE))},
+            inputs=_looked_at(six),
+        ),
+        Piece("arms", lambda: arms_sheets(rows, arms, root), inputs=[visual, _looked_at(arms)]),
+    ]
 
 
-def _gallery(workspace: Workspace) -> Files:
+def _gallery(workspace: Workspace) -> list[Piece]:
     from traps_pipeline.benchmark.records import load_release
-    from traps_pipeline.report.gallery import gallery_files
+    from traps_pipeline.report.gallery import Poster, gallery
 
     specs, clips = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
     if clips.empty:
         raise TrapsError("gallery: no clips yet; materialize videos first")
-    release = load_release()
-    return gallery_files(specs, clips, workspace.bring(clips["path"]), f"{release.name} {release.version}: all pairs")
+    release, root = load_release(), workspace.bring(clips["path"])
+    page, posters = gallery(specs, clips, f"{release.name} {release.version}: all pairs")
+
+    def picture(poster: Poster) -> Piece:
+        return Piece(poster.name, lambda: {poster.name: poster.jpeg(root)}, inputs=[poster.clip, poster.before])
+
+    return [Piece("page", lambda: {"gallery.html": page}, inputs=page.decode()), *map(picture, posters)]
 
 
 def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.benchmark.shortcuts import shortcuts
-    from traps_pipeline.report.figures.shortcuts import shortcut_figure
+    from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
     from traps_pipeline.report.writing import figure_bytes
     from traps_pipeline.scenes.picture.encode import DamagedClip
 
@@ -106,7 +149,7 @@ def _shortcuts(workspace: Workspace) -> Files:
 
 
 def _page(workspace: Workspace) -> Files:
-    from traps_pipeline.report.items import FOLDER, write_item_pages
+    from traps_pipeline.report.cell_pages import FOLDER, write_item_pages
     from traps_pipeline.report.publish import report_files, study_pictures
 
     folder = workspace.reports / FOLDER
@@ -120,14 +163,15 @@ def _page(workspace: Workspace) -> Files:
     return report_files(study, paper, cells, study_pictures(workspace))
 
 
-contact_sheet = _report(
+contact_sheet = _in_pieces(
     "contact_sheet",
-    _sheet,
+    _sheets,
     "Control and void frames of one pair of each sub-scenario, with question and ground truth; where arms were filmed, "
     "one scenario of each taxonomy with all its arms.",
     deps=["items", "arms"],
+    previewed=["contact_sheet.png", "six_pairs.png"],
 )
-gallery = _report(
+gallery = _in_pieces(
     "gallery",
     _gallery,
     "Control, void and twin of every scenario on a page that opens from disk, with words and certificates.",
@@ -201,17 +245,16 @@ _KEPT: dict[str, tuple[Any, Results]] = {}
 def _printed(name: str, reports: Sequence[Report], doc: str, previewed: Sequence[str]) -> Stage:
     """An asset of many tables or figures of the study, each made again only when a table that it reads changed."""
 
-    def made(workspace: Workspace, _: None) -> Made:
+    def pieces(workspace: Workspace) -> list[Piece]:
         def piece(report: Report) -> Piece:
             make = lambda: workspace_files(report, _results(workspace, of_paper=False))  # noqa: E731 - of this report
-            return Piece(report.name, report.reads, make)
+            return Piece(report.name, make, report.reads)
 
-        files, remade = make_pieces(workspace, name, code_of(GROUP), [piece(report) for report in reports])
-        shown = {"made again": ", ".join(remade) or "none"} | _previews(files, [f for f in previewed if f in files])
-        return Made(files, shown=shown)
+        return [piece(report) for report in reports]
 
     reads = dict.fromkeys(dep for report in reports for dep in report.reads)
-    return _stage(name, made, doc, [*reads], ["csv" if name == "report_tables" else "png"])
+    kinds = ["csv" if name == "report_tables" else "png"]
+    return _in_pieces(name, pieces, doc, deps=[*reads], kinds=kinds, previewed=previewed)
 
 
 def _printed_of_paper(name: str, reports: Sequence[Report], doc: str) -> Stage:

@@ -3,16 +3,16 @@
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ARMS, DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.previews import Markdown
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import of, stage
-from traps_pipeline.scoring.tables import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.scoring.score_rows import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -89,9 +89,9 @@ def _make_regime_tests(workspace: Workspace, _: None) -> Made:
 
 def _make_leaderboard(workspace: Workspace, _: None) -> Made:
     """Every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals, ranks."""
-    from traps_pipeline.report.leaderboard import leaderboard_markdown
+    from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
-    from traps_pipeline.scoring.leaderboard import leaderboard as rank
+    from traps_pipeline.scoring.standings import leaderboard as rank
 
     cells, judged = _scored(workspace, "leaderboard")
     board = rank(cells, intervals(resample(judged)), workspace.tables.read(CONTRASTS, {}))
@@ -101,7 +101,7 @@ def _make_leaderboard(workspace: Workspace, _: None) -> Made:
 
 
 def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
-    from traps_pipeline.scoring.leaderboard import wrong_intervals
+    from traps_pipeline.scoring.standings import wrong_intervals
 
     wrong = wrong_intervals(made.frame)
     return f"{wrong} intervals are wrong" if wrong else ""
@@ -132,8 +132,8 @@ def _make_hypotheses(workspace: Workspace, _: None) -> Made:
     variation was run."""
     from traps_pipeline.benchmark.tables import ITEMS
     from traps_pipeline.judging.verdicts import current
-    from traps_pipeline.scoring.hypotheses import DATASETS_READ
-    from traps_pipeline.scoring.hypotheses import hypotheses as by_dose
+    from traps_pipeline.scoring.doses import DATASETS_READ
+    from traps_pipeline.scoring.doses import hypotheses as by_dose
 
     judged = current(workspace, VERDICTS, dataset=DATASETS_READ)
     items = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
@@ -143,7 +143,7 @@ def _make_hypotheses(workspace: Workspace, _: None) -> Made:
 
 
 def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:
-    from traps_pipeline.scoring.hypotheses import wrong_rows
+    from traps_pipeline.scoring.doses import wrong_rows
 
     wrong = wrong_rows(made.frame)
     return f"{wrong} rows are wrong" if wrong else ""

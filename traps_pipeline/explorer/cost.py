@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, SIDES, Cell, is_ill_posed, taxonomy_of
 from traps_pipeline.benchmark.corrections import Correction
 from traps_pipeline.benchmark.specs import wording_of
 from traps_pipeline.judging.panel import tasks_for
@@ -17,6 +16,8 @@ from traps_pipeline.models.forecast import Experience, forecast
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, load_models
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.workspace import Workspace
 
 

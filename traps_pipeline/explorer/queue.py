@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import pandas as pd
 
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.storage.workspace import Workspace
 

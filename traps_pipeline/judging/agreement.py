@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, TASKS, YES, Ratings, majority, ratings
-from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS
+from traps_pipeline.protocol.datasets import DATASETS
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:

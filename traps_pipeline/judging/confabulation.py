@@ -19,13 +19,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation, is_ill_posed
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
-from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
 from traps_pipeline.models.participants import Row, when_asked
@@ -33,6 +32,9 @@ from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model, structured
 from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -67,7 +69,7 @@ class Protocol(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     n: int = Field(ge=1, description="failures per model; all if there are fewer")
     seed: int
-    regime: Literal["standard", "guided", "json"]
+    regime: str = Field(pattern=f"^({'|'.join(REGIMES)})$")
     run: int = Field(ge=1)
     judges: dict[str, str] = Field(description="judge by panel; for a panel that is not here nothing is labelled")
     models: dict[str, Evidence] = Field(min_length=1)

@@ -27,10 +27,9 @@ from pydantic import (
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.judging.answers import UNREAD, is_correct, leading_object, read_flag, read_object
-from traps_pipeline.judging.tables import VoteRow
+from traps_pipeline.judging.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
+from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
@@ -50,6 +49,7 @@ from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.parquet import Made, joined
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace

@@ -17,15 +17,15 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
-from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.ask import Settled
 from traps_pipeline.models.judges import JudgeEntry, Task
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"

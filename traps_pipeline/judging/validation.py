@@ -17,7 +17,6 @@ import pandas as pd
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.agreement import cohen_kappa
@@ -29,8 +28,9 @@ from traps_pipeline.judging.confabulation import (
     load_protocol,
     sample_id,
 )
-from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION
+from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 LABEL_COLUMNS = ("annotator", "sample_id", *AXES)

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.answers import UNREAD
+from traps_pipeline.judging.judged_answers import UNREAD
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.ratings import (
     ABSTENTION,
     ANSWER,
@@ -21,10 +21,11 @@ from traps_pipeline.judging.ratings import (
     majority,
     ratings,
 )
-from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

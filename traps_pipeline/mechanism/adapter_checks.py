@@ -18,7 +18,7 @@ import numpy as np
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching import SITES, Patch, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, record, require_patchable
 from traps_pipeline.models.local.model import LocalModel
 from traps_pipeline.models.local.prefixes import PrefixMemory, resumable
 from traps_pipeline.models.local.prompt_batches import Prompt

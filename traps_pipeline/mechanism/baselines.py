@@ -20,13 +20,13 @@ import pandas as pd
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.contrast import contrast_states
-from traps_pipeline.mechanism.control_tables import ProbeBaselineRow
+from traps_pipeline.mechanism.control_rows import ProbeBaselineRow
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.other_probes import OF_PAIRS, fit_named
 from traps_pipeline.mechanism.probes import Fit
 from traps_pipeline.mechanism.probing import Confabulated, ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.storage.media import MediaSpec, sample

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Extraction
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.probes import Scorer, auroc, standardiser
 from traps_pipeline.mechanism.stages import examined_model
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.prompts import states_prompt
+from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.storage.workspace import Workspace
 
 STATEMENTS = (

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Extraction
 from traps_pipeline.mechanism.directions import steered_scenarios
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import best_layers, gate_items, gate_table, layer_of
 from traps_pipeline.mechanism.probes import Scorer
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.capture import OF_PARTS, Pooling
+from traps_pipeline.protocol.cells import Extraction
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.base.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.mechanism.directions import KINDS
-from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
+from traps_pipeline.mechanism.transfer_paths import FAMILIES, PATH_SETS
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
+from traps_pipeline.protocol.regimes import GUIDED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +59,7 @@ def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
     """The columns of `regime_matrix` for guided directions under guided inference, by taxonomy of the direction's
     source (`family`)."""
-    guided = effects.loc[(effects["directions"] == "guided") & (effects["regime"] == "guided")]
+    guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
 
     def families(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         for family in FAMILIES:

@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS
-from traps_pipeline.mechanism.paths import probed_taxonomy
 from traps_pipeline.mechanism.probes import Scorer, Solver, auroc, fit_probe, scenario_folds
+from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
+from traps_pipeline.protocol.datasets import DATASETS
 
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
 OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"

@@ -12,10 +12,9 @@ import pandas as pd
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
-from traps_pipeline.mechanism.control_tables import GateRow, RiskCoverageRow
+from traps_pipeline.mechanism.control_rows import GateRow, RiskCoverageRow
 from traps_pipeline.mechanism.gate import (
     MID,
     OTHER_DATASETS,
@@ -31,17 +30,19 @@ from traps_pipeline.mechanism.gate import (
     separation,
     sources_of_gate,
 )
+from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.mechanism.nulls import nulled
-from traps_pipeline.mechanism.paths import probed_taxonomy
 from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import PROBES
+from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.scoring.bootstrap import TAXONOMIES, percentiles, scenario_weights
 from traps_pipeline.storage.workspace import Workspace
 
 STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
-REGIMES = ("standard", "guided")
 COVERAGES = tuple(k / 20 for k in range(1, 21))
 ALL = "all"
 
@@ -86,11 +87,11 @@ def _each(
 ) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, Made]]:
     """Regime, its outcomes, features, source and decisions of every gate."""
     outcomes = {
-        regime: found for regime in REGIMES if (found := _outcomes(workspace, entry.id, regime, states)) is not None
+        regime: found for regime in PROMPTING if (found := _outcomes(workspace, entry.id, regime, states)) is not None
     }
     if not outcomes:
         raise TrapsError(
-            f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(REGIMES)} in run 1; the "
+            f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(PROMPTING)} in run 1; the "
             "experiment must ask the model under one of these regimes"
         )
     table = gate_table(states)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.mechanism.control_tables import SteeringNullRow, SteeringPecsRow
+from traps_pipeline.mechanism.control_rows import SteeringNullRow, SteeringPecsRow
 from traps_pipeline.mechanism.directions import NULLS, VOID
 from traps_pipeline.scoring.metrics import joined_epochs, pecs_of
 

@@ -13,16 +13,17 @@ import pandas as pd
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import SIDES, Extraction
-from traps_pipeline.mechanism.control_tables import PatchingRow
+from traps_pipeline.mechanism.control_rows import PatchingRow
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.hidden_states import shown_times
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching import Patch, Recorded, patched_changes, record, require_patchable
-from traps_pipeline.mechanism.tables import PROBE_ITEMS
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
+from traps_pipeline.mechanism.patching_effects import Patch, Recorded, patched_changes, record, require_patchable
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.cells import Extraction
+from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.scoring.bootstrap import percentiles, scenario_weights
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.workspace import Workspace

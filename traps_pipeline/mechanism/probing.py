@@ -17,8 +17,6 @@ import pandas as pd
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, PROBED_DATASETS, TIME_SWAPPED, taxonomy_of
-from traps_pipeline.mechanism.paths import CURVES, LOOK_ALIKES, TRANSFER_PAIRS, Path, path_name, probed_taxonomy
 from traps_pipeline.mechanism.probes import (
     Fit,
     Split,
@@ -31,6 +29,15 @@ from traps_pipeline.mechanism.probes import (
     transfer_scores,
     within_split,
 )
+from traps_pipeline.mechanism.transfer_paths import (
+    CURVES,
+    LOOK_ALIKES,
+    TRANSFER_PAIRS,
+    Path,
+    path_name,
+    probed_taxonomy,
+)
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, TIME_SWAPPED, taxonomy_of
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 

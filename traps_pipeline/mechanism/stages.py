@@ -11,15 +11,7 @@ import numpy as np
 from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import (
-    DATASETS,
-    Cell,
-    Evaluation,
-    Extraction,
-    StatesCell,
-    is_ill_posed,
-)
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.directions import (
     Directions,
     Origin,
@@ -31,11 +23,7 @@ from traps_pipeline.mechanism.directions import (
     steered_scenarios,
     vector_digest,
 )
-from traps_pipeline.mechanism.paths import CURVES
-from traps_pipeline.mechanism.probe_items import other_clip
-from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import (
+from traps_pipeline.mechanism.mechanism_rows import (
     DIRECTIONS,
     PROBE_ITEMS,
     PROBES,
@@ -44,9 +32,15 @@ from traps_pipeline.mechanism.tables import (
     HiddenStatesRow,
     ProbeRow,
 )
-from traps_pipeline.mechanism.versions import states_folder
+from traps_pipeline.mechanism.probe_items import other_clip
+from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.probing_versions import states_folder
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.workspace import Workspace
 

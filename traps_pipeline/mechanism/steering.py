@@ -22,17 +22,16 @@ from typing import Any, NamedTuple
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import SIDES, Extraction, SteeringCell, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.deciding import Gate, conditions
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
-from traps_pipeline.mechanism.paths import sources_of
+from traps_pipeline.mechanism.mechanism_rows import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
+from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
-from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
-from traps_pipeline.mechanism.versions import loaded_params
+from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
@@ -40,6 +39,8 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.cells import Extraction, SteeringCell
+from traps_pipeline.protocol.datasets import SIDES, taxonomy_of
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

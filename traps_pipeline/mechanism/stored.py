@@ -10,9 +10,9 @@ import pandas as pd
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Extraction, StatesCell
-from traps_pipeline.mechanism.tables import HIDDEN_STATES
-from traps_pipeline.mechanism.versions import states_folder
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
+from traps_pipeline.mechanism.probing_versions import states_folder
+from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.storage.workspace import Workspace
 
 

@@ -18,7 +18,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
 from traps_pipeline.ledger.rows import settles
@@ -28,6 +27,7 @@ from traps_pipeline.models.participants import Allowed, Participant, Participant
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.models.spending import sharing, spending
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -6,10 +6,10 @@ import asyncio
 from functools import lru_cache
 from pathlib import Path
 
-from traps_pipeline.base.partitions import dataset_of
 from traps_pipeline.models.framing import observed
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.scenes.picture.policies import FramePolicy
 
 

@@ -1,4 +1,4 @@
-"""System prompts of the three regimes and of the judges, verbatim from `assets/prompts` (docs/spec.md 3.3)."""
+"""System prompts of the regimes and of the judges, verbatim from `assets/prompts` (docs/spec.md 3.3)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,12 @@ from functools import cache
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.protocol.regimes import BY_NAME
 
 PROMPTS = ASSETS / "prompts"
-_REGIME_PARTS = {
-    "standard": ("standard",),
-    "guided": ("standard", "guided_suffix"),
-    "json": ("standard", "json_suffix"),
-}
 # The fields of the object that an answer must be, by what asks for it; any other answer is free text.
 FIELDS: Mapping[str, tuple[str, ...]] = {
-    "json": ("reason", "final_answer"),
+    **{name: regime.fields for name, regime in BY_NAME.items() if regime.fields},
     "schema_answer": ("final_answer",),
     "schema_reason": ("reason", "final_answer"),
     "schema_abstain": ("reason", "abstain", "final_answer"),
@@ -52,14 +48,13 @@ def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
 def system_prompt(regime: str, dataset: str = "") -> str:
     """The regime's system prompt, in a dataset that may vary it: parts stripped and joined by one blank line."""
     varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
-    return "\n\n".join(prompt(part) for part in (*_REGIME_PARTS[regime], *varied))
+    return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *varied))
 
 
 @cache
 def vqa_prompt(name: str) -> str:
-    """The system prompt under which hidden states are extracted: `standard`, or `guided` (docs/spec.md 7.1)."""
-    parts = {"standard": ("vqa_standard",), "guided": ("vqa_standard", "vqa_guided_suffix")}[name]
-    return "\n\n".join(prompt(part) for part in parts)
+    """The system prompt under which hidden states are extracted, for one of VQA_PROMPTS (docs/spec.md 7.1)."""
+    return "\n\n".join(prompt(part) for part in BY_NAME[name].states)
 
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:

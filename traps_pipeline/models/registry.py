@@ -17,7 +17,6 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.partitions import Evaluation
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
@@ -25,6 +24,7 @@ from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
 from traps_pipeline.models.prompts import FIELDS, fields_of
 from traps_pipeline.models.thinking import Marks, marks_of
+from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.storage.media import MediaSpec, profile_digest
 
 MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry

@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from traps_pipeline.base.partitions import dataset_of
 from traps_pipeline.models.framing import observed
 from traps_pipeline.models.observer import seen
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.protocol.datasets import dataset_of
 
 # Pixels of a board in one piece. Released voids have 7,700 and more; shade in a control never had above 300.
 PANEL_PX = 1000

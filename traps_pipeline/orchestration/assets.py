@@ -1,12 +1,15 @@
 """Dagster's assets of the declared stages and sources."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack
 from typing import Any, cast
 
 import dagster as dg
+from pydantic import PrivateAttr
 
+from traps_pipeline.orchestration.checks import CURRENT, CURRENT_DOC
 from traps_pipeline.orchestration.graph import Graph, Source, Stage
-from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
+from traps_pipeline.orchestration.step import Event, guarded, run_step
 from traps_pipeline.orchestration.translation import asset_deps, asset_key, partitions_of
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.tables import Table
@@ -19,6 +22,21 @@ class WorkspaceResource(dg.ConfigurableResource):
     """The study that a run works in."""
 
     root: str
+    _steps: ExitStack = PrivateAttr(default_factory=ExitStack)
+
+    def until_torn_down(self, events: Generator[Event, None, None]) -> Iterator[Event]:
+        """Pass a step's events on, and close the step when the run ends at the latest.
+
+        Where Dagster cannot write an event down, it drops the step in the middle. Closed here, its calls in flight come
+        back and are stored, and its locks are given back; the garbage collector would close it after the threads of
+        these calls are gone, and wait for them for ever.
+        """
+        self._steps.callback(events.close)
+        return events
+
+    def teardown_after_execution(self, context: dg.InitResourceContext) -> None:
+        """See `until_torn_down`."""
+        self._steps.close()
 
     def open(self) -> Workspace:
         """The workspace. Raises TrapsError naming the remedy where there is none."""
@@ -73,7 +91,8 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
         ],
     )
     def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
-        yield from Step(stage, context, workspace.open()).run()
+        events = guarded(run_step(stage, context, workspace.open()), context)
+        yield from workspace.until_torn_down(events)
 
     return asset
 

@@ -21,6 +21,7 @@ from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.orchestration.assets import WorkspaceResource
+from traps_pipeline.orchestration.checks import CURRENT
 from traps_pipeline.orchestration.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
@@ -29,7 +30,7 @@ from traps_pipeline.orchestration.ranges import batches
 from traps_pipeline.orchestration.run import pending_in, walk
 from traps_pipeline.orchestration.runs import RunsHere, range_tags
 from traps_pipeline.orchestration.selection import failed_checks
-from traps_pipeline.orchestration.step import CURRENT, MAKE_TAG, OUTDATED, STALE
+from traps_pipeline.orchestration.step import MAKE_TAG, OUTDATED, STALE
 from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace

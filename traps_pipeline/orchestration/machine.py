@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.scenes.picture.trial import OPENGL, check_rendering
 from traps_pipeline.storage.workspace import Workspace
 

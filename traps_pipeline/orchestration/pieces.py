@@ -1,7 +1,8 @@
 """Assets that hold many files, of which only those are made again whose inputs changed.
 
-The report's tables and figures are one asset each, as a reader of the graph would draw them. A piece is one table or
-figure. Beside the asset's own state lies a note of what each piece was made from, and of the digests of its files.
+The report's tables and figures are one asset each, as a reader of the graph would draw them. A piece is one table,
+figure or picture. Beside the asset's own state lies a note of what each piece was made from, and of the digests of its
+files.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.orchestration.lineage import Lineage
@@ -21,11 +23,16 @@ Files = dict[str, bytes]  # content by path below the workspace's reports
 
 @dataclass(frozen=True)
 class Piece:
-    """One table or figure. reads: the stages and sources that it is made from; make: its files."""
+    """One table or figure. make: its files.
+
+    reads: the stages and sources that it is made from; it is made again when a version of one changes. inputs: where a
+    table is not looked at whole, the part that is, as JSON, which is compared instead.
+    """
 
     name: str
-    reads: Sequence[str]
     make: Callable[[], Files]
+    reads: Sequence[str] = ()
+    inputs: Any = None
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ def make_pieces(workspace: Workspace, stage: str, code: str, pieces: Sequence[Pi
     versions = Lineage(workspace).inputs(stage, None)
     for piece in pieces:
         mine = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
-        inputs, note = digest([code, mine]), notes.get(piece.name)
+        inputs, note = digest([code, mine if piece.inputs is None else piece.inputs]), notes.get(piece.name)
         content = _unchanged(workspace, note) if note is not None and note.inputs == inputs else None
         if content is None:
             content = piece.make()

@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote
+
+STUDY_URL = "/study"  # where `traps ui` serves the study's report, site and clips
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,11 @@ class Records:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A file of the study that a browser opens. path: below the workspace's root."""
+    """A file of the study that a browser opens. path: below the workspace's root, so that it is right in a copy."""
 
     path: str
+
+    @property
+    def url(self) -> str:
+        """Its address on the server of `traps ui`."""
+        return f"{STUDY_URL}/{quote(self.path)}"

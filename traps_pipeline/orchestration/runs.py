@@ -18,7 +18,6 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.ranges import Range, batches
-from traps_pipeline.orchestration.step import close_dropped
 from traps_pipeline.orchestration.translation import asset_key
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
@@ -98,8 +97,6 @@ class RunsHere(Runs):
             )
         except dg.DagsterExecutionInterruptedError:
             raise KeyboardInterrupt from None
-        finally:
-            close_dropped()
         failures = [event for event in result.all_events if event.is_step_failure]
         if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
             raise KeyboardInterrupt

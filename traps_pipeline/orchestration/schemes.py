@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from traps_pipeline.base.partitions import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.orchestration.partitioning import ByDimension, Pairs, Scheme, These
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
 
 

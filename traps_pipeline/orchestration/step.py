@@ -1,256 +1,135 @@
-"""The one way to make a partition.
+"""One stage in one Dagster run: which partitions are made, and which events tell Dagster of them.
 
-Whoever starts a run, the same protocol makes the partitions of a stage, in the one order that is sound: what the inputs
-are is noted before anything is read; what cannot be made yet, or would be made from something damaged, is left with the
-reason; each partition is written, read again, checked and told to Dagster as soon as it is done, with a data version
-made from its content. Below a partition that is not made nothing is made, everything else is; the last step of a run
-raises with all that is missing.
+`run_step` is the whole protocol, in the one order that is sound. What the inputs are is noted before anything is read.
+What cannot be made yet, or would be made from something damaged, is left with the reason. Each partition is written,
+read again, checked and told to Dagster as soon as it is done. The step then ends without an error, so that everything
+below it that can do without what is missing is made; the last step of a run raises for all of them (`checks`).
+
+A partition of a range gets an `AssetMaterialization` with a data version of its own, since the versions of a
+`MaterializeResult` hold for all partitions of a step (Dagster's issues 21072 and 34013). An asset without partitions
+gets a `MaterializeResult`.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Generator, Iterator, Mapping
 from typing import Any, cast
 
 import dagster as dg
+from dagster._core.definitions.source_asset import SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.redaction import redacted
-from traps_pipeline.base.workers import kept_workers
-from traps_pipeline.models.budget import BudgetReached
-from traps_pipeline.orchestration.graph import Collect, Node, Stage, name_of, the_graph
+from traps_pipeline.orchestration.checks import StageChecks, raise_for_run
+from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
-from traps_pipeline.orchestration.metadata import preview, visible_metadata
-from traps_pipeline.orchestration.translation import asset_key
+from traps_pipeline.orchestration.making import PartitionMaker
+from traps_pipeline.orchestration.metadata import partition_metadata, visible_metadata
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.workspace import Workspace
 
-CURRENT = "current"  # the check that every stage has
-CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
 BACKFILL_TAG = "dagster/backfill"  # of a run of many: one that has nothing to make must not end them
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
-REACHED = "a budget is reached"  # in a check's metadata
-STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
 TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: what this run did for it; that another run has made it
-_ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
 RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another one goes on with
-SHOWN = 12  # unmade partitions named in an error
-# Dagster skips a step below one that hands on no output, and writes an event with one version for all partitions for
-# an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
-_TOLD_ALREADY = {"__source_asset_observation__": True}
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
-# Steps that have begun and not ended. Where Dagster cannot write an event down it drops a step in the middle, in a
-# reference cycle; the garbage collector would close it later, after the threads are gone that its calls in flight need,
-# and wait for them for ever. What is held here is closed by us instead.
-_BEGUN: list[Generator[Event, None, None]] = []
+Events = Generator[Event, None, None]
+_ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
 
 
-def close_dropped() -> None:
-    """Close the steps of this process that were dropped in the middle: calls in flight come back and are stored, locks
-    are given back."""
-    while _BEGUN:
-        _BEGUN.pop().close()
+def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
+    """Make what this run is to make of a stage; yield Dagster's events. Raises TrapsError where the step cannot begin,
+    and at the end of a run for all that it has not made."""
+    step = _Step(stage, context, workspace)
+    yield from step.tell_unwanted()
+    for key in step.to_make():
+        yield from step.checks.of_parents(step.lineage, key)
+        step.admit(key)
+    made_result: dg.MaterializeResult | None = None
+    for key, made in step.make():
+        version = step.write(key, made)
+        yield from step.checks.of_made(key, made)
+        progress.current().partition(stage.name, key or "", made.tally)
+        metadata = partition_metadata(workspace, stage, made) | {TALLY: json.dumps(vars(made.tally))}
+        if stage.scheme is None:
+            metadata = visible_metadata(metadata)
+            made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
+        else:
+            yield step.history.event(stage, key, version, step.provenance, metadata)
+    yield from step.tell_taken()
+    yield from step.tell_unmade()
+    yield from step.hand_on(made_result)
+    if not step.stages_below():
+        raise_for_run(context, step.graph, stage.name)
 
 
-class Step:
-    """One stage in one run."""
+class _Step:
+    """What `run_step` knows and does; its methods are called in the order in which they stand here."""
 
     def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
-        self.stage, self.context, self.workspace = stage, context, workspace
-        self.graph = the_graph()
-        self.history = History(context.instance, self.graph)
-        if context.run_id not in _ATTEMPTS:
-            _ATTEMPTS[context.run_id] = context.instance.count_resume_run_attempts(context.run_id)
-        self._wanted = Wanted(workspace, context.run.tags.get(EXPERIMENT_TAG))
-        self.unmade: dict[str | None, TrapsError] = {}
-        self.made_at: dict[str | None, int] = {}  # when partitions that other runs make, too, had been written
-        self.taken: dict[str | None, tuple[str, Tally]] = {}  # made by others: version, and what was done here
-        self.failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}  # checks, with what is wrong
+        self.stage, self.context, self.workspace, self.graph = stage, context, workspace, the_graph()
+        self.tags = context.run.tags
+        if context.run.run_id not in _ATTEMPTS:
+            _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
+        wanted = Wanted(workspace, self.tags.get(EXPERIMENT_TAG))
+        require_machine(workspace, parts_of_run(context, stage, wanted))
+        self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
+        self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
+        self.provenance = self.history.provenance(stage) if stage.scheme else {}
+        self.checks = StageChecks(workspace, self.graph, stage)
+        self._maker = PartitionMaker(workspace, stage, self.history)
+        self._inputs: dict[str | None, Mapping[str, str]] = {}  # of what is made, noted before anything is read
+        keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
+        asked = {*stage.wanted(wanted)}
+        self._wanted, self._unwanted = [k for k in keys if k in asked], [k for k in keys if k not in asked]
 
-    def run(self) -> Iterator[Event]:
-        """See the module."""
-        close_dropped()
-        events = self._events()
-        _BEGUN.append(events)
-        try:
-            yield from events
-        except Exception as error:  # Dagster stores its traceback
-            if (shown := redacted(error)) is error:
-                raise
-            raise shown from None
-        except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):
-            # Else Dagster, which did not stop it itself, would call what a person has stopped a failure.
-            run = self.context.instance.get_run_by_id(self.context.run_id)
-            if run is not None and run.status == dg.DagsterRunStatus.STARTED:
-                self.context.instance.report_run_canceling(run, "Stopped by a signal.")
-            raise
-        finally:
-            if events in _BEGUN:
-                _BEGUN.remove(events)
-
-    def _events(self) -> Generator[Event, None, None]:
-        stage, name = self.stage, self.stage.name
-        require_machine(self.workspace, parts_of_run(self.context, self.stage, self._wanted))
-        lineage = Lineage(self.workspace, thorough=True)
-        self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
-        provenance = self.history.provenance(stage)
-        todo = list[str | None]()
-        for key in (yield from self._asked(lineage, provenance)):
-            yield from self._tell_damage(lineage, key)
-            if self.context.run.tags.get(MAKE_TAG) == OUTDATED and lineage.waits(name, key):
-                continue  # for what is above it: it would be made twice
-            if reason := lineage.blocked(name, key, current=MAKE_TAG in self.context.run.tags):
-                self.unmade[key] = TrapsError(reason)
-            else:
-                todo.append(key)
-        if todo:
-            progress.current().stage(name, len(todo))
-        inputs = {key: lineage.inputs(name, key) for key in todo}  # noted before anything is read
-        if stage.shared is not None:
-            self.made_at = {key: lineage.made_at(name, key) for key in todo}
-        for key, made in self._make(todo, inputs):
-            version = self._write(key, made, inputs[key])
-            yield from self._checks(key, made)
-            progress.current().partition(name, key or "", made.tally)
-            yield self.history.event(stage, key, version, provenance, self._metadata(made))
-        for key, (version, tally) in self.taken.items():
-            progress.current().partition(name, key or "", tally)
-            about = {TAKEN: "made by another run meanwhile", TALLY: json.dumps(vars(tally))}
-            yield self.history.event(stage, key, version, provenance, about)
-        if self.unmade:
-            end_if_resumed(self.context.instance, self.context.run_id, _ATTEMPTS[self.context.run_id])
-        for key, error in self.unmade.items():
-            reached = isinstance(error, BudgetReached)
-            yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
-        yield from self._still_failing(lineage, {*todo, *self.unmade} - self.taken.keys())
-        for output in self.context.op_def.output_dict:
-            if output != "result":
-                yield dg.Output(None, output_name=output)
-        if not self._below():
-            self._raise_for_all()
-        yield dg.MaterializeResult(metadata=_TOLD_ALREADY)
-
-    # --- what to make -------------------------------------------------------------------------------------------------
-
-    def _asked(self, lineage: Lineage, provenance: Mapping[str, str]) -> Iterator[Any]:
-        """The keys of this run that are to be made (the generator's value); tells Dagster of those that are not wanted.
-
-        A range may hold cells that no experiment of the study asks for; they count as done, so that a backfill ends.
-        """
-        stage, tags = self.stage, self.context.run.tags
-        keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in self.context.partition_keys]
-        wanted = {*stage.wanted(self._wanted)}
-        if MAKE_TAG in tags:
-            recorded = self.history.recorded(stage.name)
-            existing = tags[MAKE_TAG] == OUTDATED
-            return [k for k in keys if k in wanted and to_make(lineage, recorded, stage.name, k, existing=existing)]
-        if stage.scheme and not wanted & {*keys} and BACKFILL_TAG not in tags:
-            raise TrapsError(f"{stage.name}: nothing is made: {why_nothing(keys, tags, self.workspace)}")
-        for key in keys:
-            if key not in wanted:
-                why = f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"
-                yield self.history.event(stage, key, "not wanted", provenance, {"made": why})
-        return [key for key in keys if key in wanted]
-
-    def _tell_damage(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """A failed check for each parent that is not what was written, before anything is made from it."""
-        for parent, keys in self.graph.parents(self.stage.name, key).items():
-            if self.graph.source(parent) is None:
-                for above in keys:
-                    if damage := lineage.damage(parent, above):
-                        yield _evaluation(self.graph[parent], CURRENT, above, {"damaged": damage})
-
-    # --- making it ----------------------------------------------------------------------------------------------------
-
-    def _make(
-        self, todo: Sequence[str | None], inputs: Mapping[str | None, Mapping[str, str]]
-    ) -> Iterator[tuple[str | None, Made]]:
-        """Each partition as it is done. One that ends in a sentence leaves the others to be made."""
-        make = self.stage.make
-        if not isinstance(make, Collect):
-            for key, done in self._beside_others(todo, inputs):
-                try:
-                    made = make(self.workspace, key)
-                except TrapsError as error:
-                    self.unmade[key] = error
-                    continue
-                made.tally.add(done)
-                yield key, made
+    def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
+        """Count cells that no experiment asks for, which a range may hold, as done, so that a backfill ends."""
+        if MAKE_TAG in self.tags:
             return
-        left = [*todo]
-        try:
-            for key, made in make.partitions(self.workspace, [str(key) for key in todo]) if todo else ():
-                left.remove(key)
-                yield key, made
-        except TrapsError as error:
-            self.unmade |= dict.fromkeys(left, error)
+        if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
+            why = why_nothing(self._unwanted, self.tags, self.workspace)
+            raise TrapsError(f"{self.stage.name}: nothing is made: {why}")
+        about = {"made": f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
+        for key in self._unwanted:
+            yield self.history.event(self.stage, key, "not wanted", self.provenance, about)
 
-    def _beside_others(
-        self, todo: Sequence[str | None], inputs: Mapping[str | None, Mapping[str, str]]
-    ) -> Iterator[tuple[str | None, Tally]]:
-        """What is left for this run to make, where others may make the same, each once all files that it names are
-        there, with what was done for them here: first what no other run is at. It is had alone until the next one is
-        asked for."""
-        if self.stage.shared is None:
-            yield from ((key, Tally()) for key in todo)
-            return
-        store, later = self.workspace.store, dict[str | None, Tally]()
-        with kept_workers():
-            for key in todo:
-                done = Tally()
-                is_whole = self._make_files(key, done, wait=False)
-                lease = store.lease(f"{self.stage.name}/{key}") if is_whole else None
-                if lease is None:
-                    later[key] = done
-                    continue
-                with closing(lease):
-                    if not self._takes_over(key, inputs[key], done):
-                        yield key, done
-            for key, done in later.items():
-                if key not in self.unmade and self._make_files(key, done, wait=True):
-                    with alone(store, f"{self.stage.name}/{key}"):
-                        if not self._takes_over(key, inputs[key], done):
-                            yield key, done
+    def to_make(self) -> list[str | None]:
+        """Return the keys of this run that are to be made: all that are wanted, or what its tag says of them."""
+        if MAKE_TAG not in self.tags:
+            return self._wanted
+        recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
+        name, lineage = self.stage.name, self.lineage
+        keys = [k for k in self._wanted if to_make(lineage, recorded, name, k, existing=existing)]
+        # What waits for something above it would be made twice.
+        return [k for k in keys if not (existing and lineage.waits(name, k))]
 
-    def _make_files(self, key: str | None, done: Tally, *, wait: bool) -> bool:
-        """Make files that a partition names, and whether all are there. done: is told what was done here."""
-        assert self.stage.shared is not None, "others may make the same"
-        try:
-            made, is_whole = self.stage.shared.files(self.workspace, key, wait)
-        except TrapsError as error:
-            self.unmade[key] = error
-            return False
-        done.add(made)
-        return is_whole
+    def admit(self, key: str | None) -> None:
+        """Note the inputs of a partition that can be made, or the reason why it cannot."""
+        if reason := self.lineage.blocked(self.stage.name, key, current=MAKE_TAG in self.tags):
+            self._maker.unmade[key] = TrapsError(reason)
+        else:
+            self._inputs[key] = self.lineage.inputs(self.stage.name, key)
 
-    def _takes_over(self, key: str | None, inputs: Mapping[str, str], done: Tally) -> bool:
-        """Whether another run has made a partition of the same inputs since this step began, and has told Dagster of it
-        when it was checked, too. done: what was done for it here."""
-        stage, lineage = self.stage, Lineage(self.workspace)
-        state = lineage.state(stage.name, key)
-        if state is None or lineage.made_at(stage.name, key) == self.made_at[key]:
-            return False
-        is_told = self.history.recorded(stage.name).get(key) == state.version
-        if is_told and state.inputs == inputs and state.code == stage.code and not state.failed:
-            self.taken[key] = state.version, done
-        return key in self.taken
+    def make(self) -> Iterator[tuple[str | None, Made]]:
+        """Make what was admitted."""
+        if self._inputs:
+            progress.current().stage(self.stage.name, len(self._inputs))
+        return self._maker.make(self._inputs)
 
-    def _write(self, key: str | None, made: Made, inputs: Mapping[str, str]) -> str:
-        """Write what was made; returns its data version."""
-        stage, tables, content = self.stage, self.workspace.tables, made.content
+    def write(self, key: str | None, made: Made) -> str:
+        """Write what was made; return its data version."""
+        stage, inputs, content = self.stage, self._inputs[key], made.content
         if stage.table is not None:
-            rows = cast(Any, content)
-            return tables.write(
-                stage.table, stage.columns(key), rows, inputs, failed=made.tally.errors, code=stage.code
+            rows, failed = cast(Any, content), made.tally.errors
+            return self.workspace.tables.write(
+                stage.table, stage.columns(key), rows, inputs, failed=failed, code=stage.code
             )
         files = cast(Mapping[str, bytes], content)
         self.workspace.store.write({self.workspace.reports / path: data for path, data in files.items()})
@@ -258,86 +137,53 @@ class Step:
         write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
         return version
 
-    def _checks(self, key: str | None, made: Made) -> Iterator[dg.AssetCheckEvaluation]:
-        """Every check of a partition. A failure is kept in the workspace until the partition passes, so that each later
-        run and `traps status` tell of it, even if this run dies before it reports to Dagster."""
-        stage, failed = self.stage, made.tally.errors
-        damage = ""
-        if stage.table is not None:
-            damage = self.workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
-        wrong: dict[str, Any] = {}
-        if damage:
-            wrong["damaged"] = damage
-        if failed:
-            wrong["failed"] = _failed_calls(failed)
-        yield self._evaluation(CURRENT, key, wrong)
-        for check in stage.checks:
-            problems = check.wrong(self.workspace, key, made)
-            file = self.workspace.failed_check(stage.name, check.name, key)
-            if problems:
-                self.workspace.store.write({file: json.dumps(problems, default=str).encode()})
-            else:
-                self.workspace.store.remove([file])
-            yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
+    def tell_taken(self) -> Iterator[dg.AssetMaterialization]:
+        """Tell of partitions that other runs have made."""
+        for key, (version, tally) in self._maker.taken.items():
+            progress.current().partition(self.stage.name, key or "", tally)
+            about = {TAKEN: "made by another run meanwhile", TALLY: json.dumps(vars(tally))}
+            yield self.history.event(self.stage, key, version, self.provenance, about)
 
-    def _still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Failed checks once more, those of partitions that this run has not made, too: Dagster shows the newest result
-        of a check, and one that passes elsewhere must not hide them."""
-        name = self.stage.name
-        for key in self.graph.keys(name):
-            if key not in seen:
-                for check in self.workspace.failed_checks(name, key):
-                    self.failing[check, key] = {STILL: json.loads(self.workspace.failure(name, check, key))}
-                state = lineage.state(name, key)
-                if state is not None and state.failed:
-                    self.failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
-        for (check, key), wrong in [*self.failing.items()]:
-            yield self._evaluation(check, key, wrong)
+    def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
+        """Tell of partitions that could not be made, and of those that fail a check, in this run or before."""
+        unmade = self._maker.unmade
+        if unmade:
+            end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
+        for key, error in unmade.items():
+            yield self.checks.of_unmade(key, error)
+        yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
 
-    def _evaluation(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
-        if wrong:
-            self.failing[check, key] = wrong
-        return _evaluation(self.stage, check, key, wrong)
+    def hand_on(self, made: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
+        """Hand on what an asset without partitions has made, or outputs for which Dagster writes no event of its own.
 
-    def _metadata(self, made: Made) -> dict[str, Any]:
-        """What Dagster shows of a partition."""
-        shown: dict[str, Any] = {**made.shown, TALLY: json.dumps(vars(made.tally))}
-        if self.stage.table is None:
-            files = cast(Mapping[str, bytes], made.content)
-            pages = [path for path in files if "/" not in path]
-            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in pages}
-            return {"files": len(files)} | paths | shown
-        count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
-        rows = preview(self.stage.table, made)
-        return {count: len(made.content)} | ({"first rows": rows} if rows else {}) | shown
+        It skips what is below a step without outputs, and would write one event, with one version, for all partitions.
+        Observable sources, which tell their own versions too, carry this mark.
+        """
+        for name in self.context.op_def.output_dict:
+            if name != "result":
+                yield dg.Output(None, output_name=name)  # of a check
+        yield made or dg.MaterializeResult(metadata={SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION: True})
 
-    # --- the end ------------------------------------------------------------------------------------------------------
-
-    def _below(self) -> set[str]:
+    def stages_below(self) -> set[str]:
         """The stages of this run that are made directly from this one."""
         selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
         return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
 
-    def _raise_for_all(self) -> None:
-        """Raises TrapsError, or BudgetReached, for all that this run has not made or whose checks do not pass, here and
-        above: had the step above raised, Dagster would have made nothing below it, not even what is sound."""
-        above = self.graph.above([self.stage.name])
-        failed = dict[tuple[str, Node], dg.AssetCheckEvaluation]()
-        of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
-        for entry in self.context.instance.all_logs(self.context.run_id, of_type=of_type):
-            event = entry.get_dagster_event().asset_check_evaluation_data
-            node = (event.asset_key.path[-1], event.partition)
-            if node[0] in above and STILL not in event.metadata:
-                failed[event.check_name, node] = event
-        alike: dict[tuple[str, str], list[str]] = {}  # by stage and what is said: a reason is told once
-        for (check, node), event in failed.items():
-            for line in _lines(check, node, event):
-                alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
-        if alike:
-            shown = [f"{first} (and {len(more)} more)" if more else first for first, *more in alike.values()]
-            more = [f"... and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
-            reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
-            raise (BudgetReached if reached else TrapsError)("\n".join([*shown[:SHOWN], *more]))
+
+def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
+    """Pass a step's events on; keep keys out of the traceback that Dagster stores, and call a run that a person stopped
+    by a signal canceled: Dagster, which did not stop it itself, would call it a failure."""
+    try:
+        yield from events
+    except Exception as error:
+        if (without_keys := redacted(error)) is error:
+            raise
+        raise without_keys from None
+    except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):
+        run = context.instance.get_run_by_id(context.run.run_id)
+        if run is not None and run.status == dg.DagsterRunStatus.STARTED:
+            context.instance.report_run_canceling(run, "Stopped by a signal.")
+        raise
 
 
 def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
@@ -357,36 +203,3 @@ def to_make(
     if existing or status.kind == "missing":
         return bool(status.outdated) if existing else True
     return status.kind == "stale" or recorded.get(key) != lineage.version(name, key)
-
-
-def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
-    return dg.AssetCheckEvaluation(
-        asset_key=asset_key(stage.name),
-        check_name=check,
-        passed=not wrong,
-        partition=key,
-        metadata=visible_metadata(wrong),
-    )
-
-
-def _failed_calls(count: int) -> str:
-    return f"{count} calls failed and can be asked again"
-
-
-def _plain(problems: Any) -> Any:
-    return json.loads(json.dumps(problems, default=str))
-
-
-def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterable[str]:
-    """What a failed check says, a line each."""
-    if event.passed:
-        return
-    values = {name: value.value for name, value in event.metadata.items() if name != REACHED}
-    for name, value in values.items():
-        if check != CURRENT:
-            text = value if isinstance(value, str) else json.dumps(value)
-            yield f"check {check} of {name_of(node)} does not pass: {text}"
-        elif name == "not made":
-            yield f"{name_of(node)} is not made: {value}"
-        else:
-            yield f"{name_of(node)}: {value}"

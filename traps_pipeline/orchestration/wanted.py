@@ -10,28 +10,22 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import product
 
-from traps_pipeline.base.partitions import (
+from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.benchmark.tables import SCENE_SPECS
+from traps_pipeline.models.registry import get_model, load_models, local_models
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
     ANSWERABLE,
     BESIDE,
     CATEGORIES,
     DATASETS,
-    PROBE_PROMPT,
     PROBED_ARMS,
     PROBED_DATASETS,
-    REGIMES,
     TIME_SWAPPED,
-    VQA_PROMPTS,
-    Cell,
-    Evaluation,
-    Extraction,
-    StatesCell,
-    SteeringCell,
     all_datasets_of,
 )
-from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
-from traps_pipeline.benchmark.tables import SCENE_SPECS
-from traps_pipeline.models.registry import get_model, load_models, local_models
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, REGIMES, VQA_PROMPTS
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 

@@ -13,20 +13,27 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
-from typing import NoReturn
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NoReturn
 
 import yaml
 
 from traps_pipeline.base import process_tree
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import Guard
+from traps_pipeline.orchestration.previews import STUDY_URL
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.routing import Route
 
 TOKEN_VARIABLE = "TRAPS_UI_TOKEN"
 DANGER = "launch runs, which spend this study's budget"
 STOP_S = 45.0  # for what is told to stop: a run waits 30 s for its calls in flight
 _MODULE = "traps_pipeline.definitions"
 _DRAIN_S, _PAUSE_S = 3, 0.1
+SERVED_FOLDERS = ("reports", "site", "clips")
 
 
 def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
@@ -65,6 +72,23 @@ def _wait_for_socket(address: str, started: dict[int, str]) -> None:
         time.sleep(_PAUSE_S)
 
 
+def study_route(workspace: Workspace) -> Route:
+    """A route to the study's report, site and clips, for the links that assets show."""
+    from starlette.responses import FileResponse, PlainTextResponse, Response
+    from starlette.routing import Route
+
+    def study_file(request: Request) -> Response:
+        path = PurePosixPath(request.path_params["path"])
+        if path.parts[0] in SERVED_FOLDERS and not any(part.startswith(".") for part in path.parts):
+            file = workspace.resolve(path.as_posix())
+            inside = file.resolve().is_relative_to((workspace.root / path.parts[0]).resolve())
+            if inside and file.is_file():
+                return FileResponse(file)
+        return PlainTextResponse(f"the study has no file {path}; materialize the asset that makes it\n", 404)
+
+    return Route(f"{STUDY_URL}/{{path:path}}", study_file)
+
+
 def main() -> None:
     """Serve Dagster's pages behind the guard. Arguments: a Dagster workspace file, host, port."""
     import uvicorn
@@ -79,6 +103,7 @@ def main() -> None:
         WorkspaceProcessContext(instance, workspace_load_target=WorkspaceFileTarget([workspace])) as context,
     ):
         app = create_app_from_workspace_process_context(context)
+        app.routes.insert(0, study_route(Workspace.open()))  # Dagster's own last route takes every path
         shown = f"[{host}]" if ":" in host else host
         print(f"\n  open http://{shown}:{port}/?token={token}\n", file=sys.stderr, flush=True)
         uvicorn.run(

@@ -10,7 +10,6 @@ from typing import Any
 
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import ARMS, DATASETS, REGIMES
 from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
@@ -18,6 +17,8 @@ from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.prompts import prompt, system_prompt
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.tables import (
     CertificateRow,
     HeldOutItemRow,

@@ -21,22 +21,16 @@ from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.metrics import METRIC_WORDS
 from traps_pipeline.release.submission import table_bytes
 from traps_pipeline.scoring.bootstrap import RESAMPLES
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
 OURS = "traps-pipeline"  # makes the reference models
 EVER_SCHEMA = "0.3.0"  # of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
-_FIGURES = {  # figure to what it is, its lowest value, and whether less of it is better
-    "pecs": ("PECS = Acc x max(0, AbsRec - FalseAbs)", 0.0, False),
-    "acc": ("share of controls answered correctly", 0.0, False),
-    "abs_rec": ("share of voids abstained on", 0.0, False),
-    "false_abs": ("share of controls abstained on", 0.0, True),
-    "j": ("AbsRec - FalseAbs", -1.0, False),
-}
 _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
 Row = Mapping[str, Any]
 
@@ -124,7 +118,7 @@ def _ever_record(
 
 
 def _ever_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str, Any]]:
-    for name, (what, least, less_is_better) in _FIGURES.items():
+    for name, metric in METRIC_WORDS.items():
         score: dict[str, Any] = {"score": float(row[name]), "details": {"panel": row["panel"], "epoch": row["epoch"]}}
         low, high = row[f"{name}_ci_low"], row[f"{name}_ci_high"]
         if pd.notna(low) and pd.notna(high):
@@ -142,13 +136,13 @@ def _ever_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str
                 "samples_number": 2 * int(row["n_pairs"]),
             },
             "metric_config": {
-                "evaluation_description": what,
+                "evaluation_description": metric.meaning,
                 "metric_id": f"{release.name}.{name}",
                 "metric_name": name,
                 "metric_unit": "proportion",
-                "lower_is_better": less_is_better,
+                "lower_is_better": metric.less_is_better,
                 "score_type": "continuous",
-                "min_score": least,
+                "min_score": metric.lowest,
                 "max_score": 1.0,
             },
             "score_details": score,

@@ -21,19 +21,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import RULES_VERSION, load_panel, panel_id
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import READING
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.models.thinking import Marks
-from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

@@ -18,9 +18,9 @@ from traps_pipeline.models.judges import id_of_seats
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
 from traps_pipeline.release.tables import SUBMITTED
 from traps_pipeline.release.verification import Verified, verify
-from traps_pipeline.report.leaderboard import leaderboards, legend
+from traps_pipeline.report.leaderboard_page import leaderboards, legend
 from traps_pipeline.report.writing import environment, table_html
-from traps_pipeline.scoring.board import score
+from traps_pipeline.scoring.scored import score
 
 PAGE, TABLE = "index.html", "leaderboard.parquet"
 TITLE = "TRAPSBench: submissions"

@@ -16,14 +16,13 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.benchmark.items import item_hash
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.answers import is_correct
+from traps_pipeline.judging.judged_answers import is_correct
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
-from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_seats
 from traps_pipeline.models.prompts import prompt_version
@@ -31,9 +30,12 @@ from traps_pipeline.models.reading import degenerate
 from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.submission import Submission
-from traps_pipeline.scoring.board import Scored, score
-from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
+from traps_pipeline.scoring.scored import Scored, score
 from traps_pipeline.storage.tables import Table
 
 SHOWN = 10  # sentences of one kind; the others are counted

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation, is_ill_posed, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
+from traps_pipeline.protocol.regimes import GUIDED, STANDARD
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS
 
@@ -51,7 +53,7 @@ def cases(verdicts: pd.DataFrame) -> pd.DataFrame:
     abstains, answers = voids.loc[voids["abstained"]], voids.loc[~voids["abstained"]]
     item, pair = ["item_id", "run"], ["dataset", "scenario_id", "run"]
     scene = ["taxonomy", "scenario_id", "run"]
-    standard, guided = answers.loc[answers["regime"] == "standard"], abstains.loc[abstains["regime"] == "guided"]
+    standard, guided = answers.loc[answers["regime"] == STANDARD], abstains.loc[abstains["regime"] == GUIDED]
     visual, textual = answers.loc[~answers["ill_posed"]], abstains.loc[abstains["ill_posed"]]
     found = [
         _matched("inverted", controls.loc[controls["abstained"]], answers, [*pair, "model", "regime"]),

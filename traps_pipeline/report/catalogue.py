@@ -11,26 +11,26 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
-from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
-from traps_pipeline.report.figures import inside as figures_of_inside
-from traps_pipeline.report.printed import mechanism as printed_mechanism
-from traps_pipeline.report.printed import scores as printed_scores
-from traps_pipeline.report.printed import setup as printed_setup
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.figures import abstention, grids, landscape, steering_figures
+from traps_pipeline.report.figures import control_figures as figures_of_inside
+from traps_pipeline.report.printed import printed_mechanism as printed_mechanism
+from traps_pipeline.report.printed import printed_scores as printed_scores
+from traps_pipeline.report.printed import printed_setup as printed_setup
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables import (
     comparisons,
-    hypotheses,
-    inside,
-    judges,
+    control_reports,
+    human_tables,
+    hypothesis_tables,
+    judge_tables,
     leaderboards,
-    people,
-    setup,
+    setup_tables,
     sub_scenarios,
 )
-from traps_pipeline.report.tables import mechanism as tables_of_mechanism
-from traps_pipeline.report.tables import patching as tables_of_patching
-from traps_pipeline.report.tables import probes as tables_of_probes
-from traps_pipeline.report.tables.shared import printed
+from traps_pipeline.report.tables import patching_tables as tables_of_patching
+from traps_pipeline.report.tables import probe_tables as tables_of_probes
+from traps_pipeline.report.tables import steering_tables as tables_of_mechanism
+from traps_pipeline.report.tables.table_columns import printed
 from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
 
 if TYPE_CHECKING:
@@ -214,18 +214,20 @@ TABLES: tuple[TableReport, ...] = (
         printed_scores.chaotic_sub_scenarios,
         recomputed=("chaotic_sub_scenarios",),
     ),
-    TableReport("hypotheses", hypotheses.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
-    TableReport("judge_agreement", judges.agreement, ("agreement",), printed_setup.agreement),
-    TableReport("judge_bias", judges.judge_bias, ("judge_bias", "leave_one_out")),
-    TableReport("confabulation", judges.confabulation, ("confabulation_prevalence",), printed_setup.confabulation),
-    TableReport("people", people.people, ("human_row", "human_agreement"), title="People"),
+    TableReport("hypotheses", hypothesis_tables.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
+    TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_setup.agreement),
+    TableReport("judge_bias", judge_tables.judge_bias, ("judge_bias", "leave_one_out")),
+    TableReport(
+        "confabulation", judge_tables.confabulation, ("confabulation_prevalence",), printed_setup.confabulation
+    ),
+    TableReport("people", human_tables.people, ("human_row", "human_agreement"), title="People"),
     TableReport(
         "judge_corrected",
-        people.judge_corrected,
+        human_tables.judge_corrected,
         ("panel_errors", "corrected"),
         title="Corrected for judges’ errors",
     ),
-    TableReport("judge_validation", judges.validation, ("judge_validation",), printed_setup.validation),
+    TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_setup.validation),
     TableReport(
         "probes",
         tables_of_probes.probes,
@@ -235,9 +237,12 @@ TABLES: tuple[TableReport, ...] = (
         "Probes",
     ),
     TableReport(
-        "probe_baselines", inside.probe_baselines, ("probes", "probe_baselines"), title="Probes and their baselines"
+        "probe_baselines",
+        control_reports.probe_baselines,
+        ("probes", "probe_baselines"),
+        title="Probes and their baselines",
     ),
-    TableReport("gate", inside.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
+    TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", tables_of_patching.patching, ("patching",)),
     TableReport(
         "cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines, title="Void directions"
@@ -252,13 +257,15 @@ TABLES: tuple[TableReport, ...] = (
     ),
     TableReport(
         "steering_controls",
-        inside.steering_nulls,
+        control_reports.steering_nulls,
         ("steering_nulls", "steering_pecs"),
         title="Steering among its controls",
     ),
-    TableReport("composition", setup.composition, ("items",), printed_setup.composition),
-    TableReport("models", setup.models, ("leaderboard",), printed_setup.models),
-    TableReport("hyperparameters", setup.hyperparameters, ("leaderboard", "judge_bias"), printed_setup.hyperparameters),
+    TableReport("composition", setup_tables.composition, ("items",), printed_setup.composition),
+    TableReport("models", setup_tables.models, ("leaderboard",), printed_setup.models),
+    TableReport(
+        "hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"), printed_setup.hyperparameters
+    ),
 )
 FIGURES: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),
@@ -292,15 +299,19 @@ FIGURES: tuple[FigureReport, ...] = (
         ("steering_effects", "steering_nulls"),
         published=False,
     ),
-    FigureReport("probe_curves", "Probe transfer by layer", mechanism.probe_curves, ("probes",), published=False),
-    FigureReport("confabulated_strip", "Probes on confabulated voids", mechanism.confabulated_strip, ("probes",)),
+    FigureReport(
+        "probe_curves", "Probe transfer by layer", steering_figures.probe_curves, ("probes",), published=False
+    ),
+    FigureReport(
+        "confabulated_strip", "Probes on confabulated voids", steering_figures.confabulated_strip, ("probes",)
+    ),
     FigureReport(
         "dose_response",
         "Steering: dose and response",
-        mechanism.dose_response,
+        steering_figures.dose_response,
         ("steering_effects", "steering_shares"),
     ),
-    FigureReport("cosines", "Cosines of void directions", mechanism.cosine_heatmaps, ("cosines",)),
+    FigureReport("cosines", "Cosines of void directions", steering_figures.cosine_heatmaps, ("cosines",)),
 )
 
 INSIDE = ("probe_baselines", "gate_arrows", "patching", "doses_among_nulls")  # figures of controls inside models

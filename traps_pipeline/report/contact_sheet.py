@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.parts.vision import before_panel
 from traps_pipeline.scenes.picture.encode import decode

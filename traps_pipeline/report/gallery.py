@@ -45,36 +45,44 @@ class ShownScenario:
     certificate: Mapping[str, str]
 
 
-def gallery_files(specs: pd.DataFrame, videos: pd.DataFrame, root: Path, title: str) -> dict[str, bytes]:
-    """`gallery.html` and its posters, by path under the reports folder. specs are SCENE_SPECS rows, videos VIDEOS rows.
+@dataclass(frozen=True)
+class Poster:
+    """The picture of a clip on the page: its last frame, or the last one before a panel closes the clip.
 
-    Raises DamagedClip when a clip cannot be decoded.
+    name: its file under the reports folder; clip: under the study's folder; before: the frame that the panel closes.
     """
+
+    name: str
+    clip: str
+    before: int | None
+
+    def jpeg(self, root: Path) -> bytes:
+        """The picture, of a clip under root. Raises DamagedClip when it cannot be decoded."""
+        import cv2
+
+        frames, _ = decode(root / self.clip)
+        small = cv2.resize(frames[: self.before][-1], (POSTER_WIDTH, POSTER_HEIGHT), interpolation=cv2.INTER_AREA)
+        _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
+        return jpeg.tobytes()
+
+
+def gallery(specs: pd.DataFrame, videos: pd.DataFrame, title: str) -> tuple[bytes, list[Poster]]:
+    """`gallery.html` and the posters that it shows. specs are SCENE_SPECS rows, videos VIDEOS rows."""
     clips = {(row["scenario_id"], row["side"]): str(row["path"]) for row in videos.to_dict("records")}
-    files: dict[str, bytes] = {}
+    posters = list[Poster]()
     sections: defaultdict[str, list[ShownScenario]] = defaultdict(list)
     for spec in specs.sort_values("scenario_id").to_dict("records"):
-        if all((spec["scenario_id"], side) in clips for side in SIDES):
+        scenario_id = spec["scenario_id"]
+        if all((scenario_id, side) in clips for side in SIDES):
             for side in SIDES:
-                shown = closes_frame(spec) if side == "control" else None
-                files[_poster(spec["scenario_id"], side)] = _last_frame(root / clips[spec["scenario_id"], side], shown)
+                before = closes_frame(spec) if side == "control" else None
+                posters.append(Poster(_poster(scenario_id, side), clips[scenario_id, side], before))
             sections[spec["family"]].append(_entry(spec, clips))
-    files["gallery.html"] = _render(title, dict(sorted(sections.items()))).encode()
-    return files
+    return _render(title, dict(sorted(sections.items()))).encode(), posters
 
 
 def _poster(scenario_id: str, side: str) -> str:
     return f"{POSTERS}/{scenario_id}-{side}.jpg"
-
-
-def _last_frame(clip: Path, before: int | None) -> bytes:
-    """The last frame, or the last one before a panel closes the clip, as a JPEG."""
-    import cv2
-
-    frames, _ = decode(clip)
-    small = cv2.resize(frames[:before][-1], (POSTER_WIDTH, POSTER_HEIGHT), interpolation=cv2.INTER_AREA)
-    _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return jpeg.tobytes()
 
 
 def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> ShownScenario:

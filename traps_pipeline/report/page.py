@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from traps_pipeline.report.leaderboard import leaderboards, legend, provenance
+from traps_pipeline.report.leaderboard_page import leaderboards, legend, provenance
 from traps_pipeline.report.writing import Behind, PrintedTable, environment, table_html
 
 WIDE_PX = 1300  # a picture with more pixels across gets the width of the page

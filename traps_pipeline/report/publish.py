@@ -8,14 +8,15 @@ from pathlib import Path
 import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.cases import cases_files
 from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
+from traps_pipeline.report.cell_pages import FOLDER, addresses, write_item_pages
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
-from traps_pipeline.report.items import FOLDER, addresses, write_item_pages
-from traps_pipeline.report.leaderboard import leaderboard_markdown
+from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import (
     Block,
     Card,
@@ -24,10 +25,10 @@ from traps_pipeline.report.page import (
     table_block,
 )
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables.audited import audit_table
-from traps_pipeline.report.tables.people import said_by_people
+from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.terms import INSIDE_TERMS
 from traps_pipeline.report.writing import Behind, environment, figure_files, table_files
 from traps_pipeline.storage.workspace import Workspace

@@ -8,18 +8,18 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism.effects import in_gaps
+from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
 from traps_pipeline.mechanism.shares import of_paper
-from traps_pipeline.mechanism.tables import COSINES, STEERING_EFFECTS
 from traps_pipeline.models.judges import panel_id
-from traps_pipeline.report.leaderboard import judged_by
-from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.report.leaderboard_page import judged_by
+from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from traps_pipeline.base.partitions import ARMS, VARIATIONS
-from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW
+from traps_pipeline.protocol.datasets import ARMS, VARIATIONS
+from traps_pipeline.protocol.metrics import METRIC_WORDS, SHARES
+from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW
 
 TITLES = {
     "overall": "Overall",
@@ -22,7 +23,7 @@ ROBUST_TERMS = {
     "gap": "PECS of the runs that PECS-R uses, minus PECS-R: the part of PECS that may come from shortcuts",
 }
 # The side of the items that a share counts.
-SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}
+SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
+from traps_pipeline.protocol.datasets import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes.parts.independence import dependence
 from traps_pipeline.scenes.physics.kit import Family

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.models.registry import load_models
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.scoring.epochs import require_one_epoch
 from traps_pipeline.scoring.metrics import joined_epochs, mean
 
@@ -103,10 +104,10 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     import pandas as pd
 
     cells = _checked(cells)
-    cells = cells.loc[cells["regime"].isin(["standard", "guided"])]
+    cells = cells.loc[cells["regime"].isin(PROMPTING)]
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
     rows = overall(cells) if means is None else means
-    guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in ("guided", "standard"))
+    guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in (GUIDED, STANDARD))
     both = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
     return pd.DataFrame({"model": both, "ratio": ratio(guided.loc[both], standard.loc[both])})
 
@@ -269,8 +270,8 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     for key, group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
         taxonomy, scope = cast(tuple[str, str], key)
         visual, textual = group.loc[group["dataset"] == taxonomy], group.loc[group["dataset"] != taxonomy]
-        by_regime = {r: visual.loc[visual["regime"] == r].set_index("model") for r in ("standard", "guided")}
-        standard, guided = (by_regime[r].dropna(subset=SHARES) for r in ("standard", "guided"))
+        by_regime = {r: visual.loc[visual["regime"] == r].set_index("model") for r in PROMPTING}
+        standard, guided = (by_regime[r].dropna(subset=SHARES) for r in PROMPTING)
         asked = textual.loc[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
         epochs = pd.DataFrame({"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": asked["epoch"]})
         require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")

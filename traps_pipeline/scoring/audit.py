@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import LONG, transfer_type
+from traps_pipeline.protocol.datasets import LONG, transfer_type
 from traps_pipeline.scoring.analyses import SHARES, models_of, overall
 from traps_pipeline.scoring.claims import CLAIMS
 from traps_pipeline.scoring.published import published, published_cells, published_overall, published_rows

@@ -21,7 +21,7 @@ from zlib import crc32
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts, pecs_of
 
 TAXONOMIES = ("occlusion", "chaotic")

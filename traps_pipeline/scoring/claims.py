@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.base.partitions import REGIMES
 from traps_pipeline.models.registry import load_models
+from traps_pipeline.protocol.regimes import GUIDED, REGIMES
 from traps_pipeline.scoring.analyses import (
     hidden_against_others,
     models_of,
@@ -40,7 +40,7 @@ def _video_native() -> list[str]:
 
 def _frontier() -> Recomputed:
     cells = published_cells()
-    frontier = pareto_frontier(cells.loc[cells["regime"] == "guided"])
+    frontier = pareto_frontier(cells.loc[cells["regime"] == GUIDED])
     return Recomputed("; ".join(sorted(frontier["model"])))
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import DATASETS, REGIMES
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import (
     ENTRY,
     RESAMPLED,
@@ -29,9 +30,9 @@ from traps_pipeline.scoring.bootstrap import (
     resample,
 )
 from traps_pipeline.scoring.epochs import answered, origins_of, refusal
-from traps_pipeline.scoring.leaderboard import means_over_runs, standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
-from traps_pipeline.scoring.tables import CONTRASTS, REGIME_TESTS
+from traps_pipeline.scoring.score_rows import CONTRASTS, REGIME_TESTS
+from traps_pipeline.scoring.standings import means_over_runs, standings
 
 FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05

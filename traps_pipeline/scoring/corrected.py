@@ -14,9 +14,9 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
+from traps_pipeline.judging.label_units import ABOUT_ANSWERS, TaskName
 from traps_pipeline.judging.labels import truths
-from traps_pipeline.judging.people import ABOUT_ANSWERS, TaskName
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,
@@ -31,9 +31,9 @@ from traps_pipeline.scoring.bootstrap import (
     shares_of,
     with_unseen,
 )
+from traps_pipeline.scoring.human_score_rows import CORRECTED, PANEL_ERRORS
+from traps_pipeline.scoring.human_scores import stratum_weights, with_intervals
 from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
-from traps_pipeline.scoring.people import stratum_weights, with_intervals
-from traps_pipeline.scoring.people_tables import CORRECTED, PANEL_ERRORS
 
 SHARES: tuple[TaskName, ...] = ("correctness", "abstention", "abstention")  # behind Acc, FalseAbs and AbsRec
 NO_BETTER = "the panel agrees with people no better than chance"

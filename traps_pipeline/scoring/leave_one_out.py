@@ -9,9 +9,9 @@ import pandas as pd
 
 from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
 from traps_pipeline.scoring.bootstrap import ENTRY
-from traps_pipeline.scoring.leaderboard import standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
-from traps_pipeline.scoring.tables import LEAVE_ONE_OUT
+from traps_pipeline.scoring.score_rows import LEAVE_ONE_OUT
+from traps_pipeline.scoring.standings import standings
 
 _COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from traps_pipeline.base.partitions import sides_of
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.protocol.datasets import sides_of
+from traps_pipeline.scoring.score_rows import METRICS
 
 if TYPE_CHECKING:
     import pandas as pd

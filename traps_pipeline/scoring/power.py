@@ -15,7 +15,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from traps_pipeline.base.partitions import DATASETS, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import RESAMPLED, TAXONOMIES, figures_of, interval, limits_of
 from traps_pipeline.scoring.contrasts import SEPARABLE_BELOW, least_p
 from traps_pipeline.scoring.metrics import pecs_of

@@ -10,7 +10,7 @@ import pandas as pd
 
 from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.scoring.metrics import joined_epochs, wilson
-from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
+from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE
 
 # Maps a column of CONFABULATION_PREVALENCE to the axes that must all apply.
 SHARES: Mapping[str, tuple[str, ...]] = {

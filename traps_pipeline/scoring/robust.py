@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.partitions import (
+from traps_pipeline.protocol.datasets import (
     ANSWERABLE_ARMS,
     ARMS,
     DATASETS,
@@ -35,7 +35,7 @@ from traps_pipeline.scoring.bootstrap import (
     run_sums,
 )
 from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
-from traps_pipeline.scoring.tables import ROBUST
+from traps_pipeline.scoring.score_rows import ROBUST
 
 TWIN = "twin_control"
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))

@@ -3,6 +3,8 @@
 from datetime import datetime
 from typing import Annotated
 
+from traps_pipeline.protocol.regimes import REGIMES, one_of
+
 ScenarioId = Annotated[str, "family and number"]
 ItemId = Annotated[str, "dataset:scenario_id:side"]
 PairId = Annotated[str, "dataset:scenario_id"]
@@ -15,7 +17,7 @@ Question = Annotated[str, "with its choices"]
 ClipPath = Annotated[str, "mp4, relative to the workspace"]
 MediaDigest = Annotated[str, "digest of the clip's file"]
 Model = Annotated[str, "id in assets/models.yaml"]
-Regime = Annotated[str, "standard, guided or json"]
+Regime = Annotated[str, one_of(REGIMES)]
 Run = Annotated[int, "independent repetition, from 1"]
 Outcome = Annotated[str, "answer, truncated, unfinished, empty, refused, error or malformed"]
 AnswerOutcome = Annotated[

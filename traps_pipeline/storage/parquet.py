@@ -30,6 +30,7 @@ _FOOTER, _SUFFIX = b"traps", ".parquet"
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
 _ROWS_AT_ONCE = 1000  # of a table as Python values
 _WHOLE: dict[Path, str] = {}  # files whose bytes this process has held against the digest in them, by their stamp
+_FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # of files, with their stamp
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,6 @@ class TableStore:
         """What the footer of a partition says; None if it was never written, or by a version with other columns (it is
         then made anew). Raises TrapsError if it is unreadable."""
         import pyarrow as pa
-        import pyarrow.parquet as pq
 
         path = self.path(table, partition)
         if not self._store.has(path):
@@ -166,10 +166,10 @@ class TableStore:
             if (note := self._store.note(path)) is not None:
                 noted = json.loads(note)
                 footer, names = noted["state"], noted["columns"]
+                state = State(**json.loads(footer))
             else:
-                schema = pq.ParquetFile(_sound_bytes(self._store.here(path))).schema_arrow
-                footer, names = (schema.metadata or {})[_FOOTER], schema.names
-            return State(**json.loads(footer)) if names == table.arrow_schema().names else None
+                state, names = _footer_of(self._store.here(path))
+            return state if names == table.arrow_schema().names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
@@ -183,7 +183,9 @@ class TableStore:
         if not thorough and self._store.note(path) is not None:
             return ""  # the row vouches for it, and whoever reads it holds it against the row's digest
         try:
-            _sound_bytes(self._store.here(path))
+            file = self._store.here(path)
+            if _WHOLE.get(file) != _stamp(file.stat()):
+                _sound_bytes(file)
         except FileNotFoundError:
             return ""
         except (TrapsError, OSError) as error:
@@ -306,6 +308,18 @@ def _sound_bytes(path: Path) -> io.BytesIO:
             raise TrapsError(f"{path}: is not what was written (it was altered); run again, and it is made anew")
         _WHOLE[path] = stamp
     return io.BytesIO(content)
+
+
+def _footer_of(path: Path) -> tuple[State, list[str]]:
+    """What a file's footer says, and the names of its columns; kept while its size and time are the same, since a run
+    asks for each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException."""
+    import pyarrow.parquet as pq
+
+    stamp = _stamp(path.stat())
+    if (kept := _FOOTERS.get(path)) is None or kept[0] != stamp:
+        schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
+        kept = _FOOTERS[path] = stamp, State(**json.loads((schema.metadata or {})[_FOOTER])), schema.names
+    return kept[1], kept[2]
 
 
 def altered(path: Path) -> str:

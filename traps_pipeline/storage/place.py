@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import LONGEST
+from traps_pipeline.base.paths import user_cache
 
 STUDY = "study.yaml"
 SCRATCH = "TRAPS_SCRATCH"  # names the folder in which the files of object stores are while they are used
@@ -46,5 +47,4 @@ def name_of(place: Place) -> str:
 
 def scratch_of(address: str) -> Path:
     """The folder of this machine for the files of a study in an object store."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get(SCRATCH) or Path(cache) / "traps").absolute() / name_of(address)
+    return Path(os.environ.get(SCRATCH) or user_cache()).absolute() / name_of(address)

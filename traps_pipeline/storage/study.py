@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.base.names import Name, check_name
-from traps_pipeline.base.partitions import PROBE_PROMPT, VQA_PROMPTS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, VQA_PROMPTS
 
 FORMAT = 1  # of a workspace
-Regime = Literal["standard", "guided"]
+Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
 # --- what is asked inside local models --------------------------------------------------------------------------------

@@ -11,9 +11,9 @@
     VIDEOS = Table("videos", VideoRow, partition_by=(), key=("scenario_id", "side"))
 
 Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
-keep the order of the fields. Each package declares its tables in its own module `tables`; columns that several packages
-share are in `storage.columns`. The Arrow schema is made from the dataclass, and every file is checked against it on
-writing and on reading.
+keep the order of the fields. Each package declares its tables in a module `tables` or `..._rows`; columns
+that several packages share are in `storage.columns`. The Arrow schema is made from the dataclass, and every file is
+checked against it on writing and on reading.
 """
 
 from __future__ import annotations

@@ -48,6 +48,7 @@ def examine(place: Place) -> Iterator[Finding]:
         ("rendering", draw_frame),
         ("encoding", encode_clip),
         ("disk", lambda: _disk(scratch_of(place) if isinstance(place, str) else place)),
+        ("clip cache", _clip_cache),
         ("workspace", lambda: _workspace(place)),
         ("keys", _keys),
         ("network", check_network),
@@ -236,6 +237,13 @@ def _checkout() -> str:
 
 def _disk(root: Path) -> str:
     return check_disk(root, MIN_FREE_GB)
+
+
+def _clip_cache() -> str:
+    from traps_pipeline.scenes.worlds.clip_cache import VARIABLE, ClipCache
+
+    rendered = ClipCache.of_user()
+    return "off" if rendered is None else f"{rendered.describe()}; {VARIABLE} sets its GB, or off"
 
 
 def _workspace(place: Place) -> str:

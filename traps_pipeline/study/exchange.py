@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing, write_bytes
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
@@ -34,6 +33,7 @@ from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.study.experiment import Experiment

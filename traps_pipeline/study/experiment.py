@@ -9,12 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, SCHEMAS, Cell, Evaluation
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SCHEMAS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 
 EXPERIMENTS = ASSETS / "experiments"

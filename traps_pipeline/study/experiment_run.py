@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.partitions import Cell
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.models.backends import require_libraries
 from traps_pipeline.models.judges import load_panel
@@ -24,6 +23,7 @@ from traps_pipeline.orchestration.selection import (
     stages_until,
 )
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
 

@@ -22,7 +22,6 @@ import numpy as np
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.judging.panel import parse_vote, vote_request
@@ -36,6 +35,7 @@ from traps_pipeline.models.reading import degenerate, read_answer
 from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of, effective_params
 from traps_pipeline.models.request import MALFORMED, UNFINISHED, WITH_TEXT, Outcome, Request, TransientError
 from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore
 from traps_pipeline.storage.workspace import Workspace

@@ -7,21 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from traps_pipeline.base.partitions import (
-    BESIDE,
-    DATASETS,
-    Cell,
-    SteeredEvaluation,
-    all_datasets_of,
-    datasets_of_category,
-    sides_of,
-)
 from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.benchmark.items import expected_items
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
-from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
 from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of
@@ -30,6 +21,8 @@ from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
+from traps_pipeline.protocol.datasets import BESIDE, DATASETS, all_datasets_of, datasets_of_category, sides_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import REGIMES, Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
+
+# Without the times of calls, for which pyarrow would import pandas.
+_OF_ANSWER = ("item_id", "text", "error", "outcome")
+_OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "rationale", "invalid_reason")
 
 
 def why(workspace: Workspace, item_id: str) -> Iterator[str]:
@@ -49,21 +54,21 @@ def why(workspace: Workspace, item_id: str) -> Iterator[str]:
 
 def _judged(workspace: Workspace, cell: Cell, item_id: str) -> Iterator[str]:
     """The answer to an item as its table has it, and the votes on it."""
-    for answer in _rows_of(workspace, RESPONSES, cell, item_id):
+    for answer in _rows_of(workspace, RESPONSES, _OF_ANSWER, cell, item_id):
         said = _short(answer["text"]) if answer["text"] else answer["error"] or ""
         yield f"    {answer['outcome']}: {said}"
-    for vote in _rows_of(workspace, VOTES, cell, item_id):
+    for vote in _rows_of(workspace, VOTES, _OF_VOTE, cell, item_id):
         decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
         word = "invalid" if not vote["valid"] else "yes" if decision else "no"
         yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
 
 
-def _rows_of(workspace: Workspace, table: Table, cell: Cell, item_id: str) -> list[dict[str, Any]]:
+def _rows_of(
+    workspace: Workspace, table: Table, columns: Sequence[str], cell: Cell, item_id: str
+) -> list[dict[str, Any]]:
     if workspace.tables.state(table, cell.partition) is None:
         return []
-    rows = workspace.tables.read(table, cell.partition)
-    mine = rows.loc[rows["item_id"] == item_id].astype(object)
-    return mine.where(mine.notna(), None).to_dict("records")  # a null text is NaN in a frame
+    return [row for row in workspace.tables.records(table, cell.partition, columns) if row["item_id"] == item_id]
 
 
 def _about(row: Mapping[str, Any]) -> Any:
@@ -71,8 +76,10 @@ def _about(row: Mapping[str, Any]) -> Any:
 
 
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
-    items = workspace.tables.read_all(ITEMS, dataset=dataset)
-    return next((item for item in items.to_dict("records") if item["item_id"] == item_id), None)
+    if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
+        return None
+    items = workspace.tables.records(ITEMS, {"dataset": dataset})
+    return next((item for item in items if item["item_id"] == item_id), None)
 
 
 def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:

@@ -20,13 +20,14 @@ import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import REGIMES, Cell, Evaluation
 from traps_pipeline.judging.confabulation import label_request, load_protocol
 from traps_pipeline.judging.panel import tasks_for, vote_request
 from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, sample
 from traps_pipeline.study.loopback import PLACEHOLDER_KEY, render

@@ -30,7 +30,7 @@ from tests.local_models import (
 )
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.mechanism.versions import loaded_params
+from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local import model as local_model
 from traps_pipeline.models.local.adapter import Sampling, load_local_model

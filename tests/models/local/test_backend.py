@@ -18,10 +18,9 @@ from tests.build.ledger import local
 from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, Family, checkpoint, clip, entry, model
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.cli import main
-from traps_pipeline.mechanism.versions import loaded_params
+from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models import registry
 from traps_pipeline.models.ask import Call, Settled, Work, run_work
 from traps_pipeline.models.backends import make_backend
@@ -32,6 +31,7 @@ from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.participants import Participants, Row
 from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.media import MediaStore
 from traps_pipeline.storage.study import Study
 

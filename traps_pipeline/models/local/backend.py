@@ -14,11 +14,11 @@ from threading import Event
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import dataset_of
 from traps_pipeline.models.framing import framed
 from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 

@@ -5,8 +5,8 @@ those of the last lower block with its kind of attention (`shared_kv_states`, a 
 vector of its own that is made of the token and its embedding (`per_layer_input`). So a state at block l does not say
 what blocks behind l make of it; whoever puts another state there, or goes on from it, gives them both as well.
 
-Qwen3-VL's deepstack features, which are added between blocks, are inputs of its decoder: `mechanism.patching` and
-`prefixes` see to them there.
+Qwen3-VL's deepstack features, which are added between blocks, are inputs of its decoder: `prefixes` and
+`mechanism.patching_effects` see to them there.
 """
 
 from __future__ import annotations

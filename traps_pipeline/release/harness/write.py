@@ -13,10 +13,12 @@ import yaml
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.base.partitions import DATASETS, REGIMES
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.judges import RULES_PANEL, panel_id
 from traps_pipeline.models.registry import PROTOCOL
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.metrics import METRIC_WORDS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
@@ -32,7 +34,7 @@ _COPIED = {
     "models/endings.py": "endings.py",
     "models/thinking.py": "thinking.py",
     "models/reading.py": "reading.py",
-    "judging/answers.py": "answers.py",
+    "judging/judged_answers.py": "answers.py",
     "judging/rules.py": "rules.py",
     "release/harness/scoring.py": "scoring.py",
     "release/harness/items.py": "items.py",
@@ -184,9 +186,9 @@ def _lmms(target: Path, about: Mapping[str, Any]) -> None:
                 {
                     "metric": f"traps_{name}",
                     "aggregation": _Function(f"utils.{name}"),
-                    "higher_is_better": name in ("pecs", "acc", "abs_rec", "j"),
+                    "higher_is_better": name in METRIC_WORDS and not METRIC_WORDS[name].less_is_better,
                 }
-                for name in ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")
+                for name in (*METRIC_WORDS, "missing", "unread")
             ],
             "metadata": [{"version": about["version"], "canary": about["canary"]}],
         }

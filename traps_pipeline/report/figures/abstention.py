@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import taxonomy_of
+from traps_pipeline.protocol.datasets import taxonomy_of
+from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
-from traps_pipeline.report.results import Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import (
     COLUMN_IN,
@@ -98,7 +99,7 @@ def abs_rec_by_model(results: Results) -> Figure:
     """AbsRec of every model under standard (hollow) and guided (filled) with equal weights of datasets; bars are the
     deviation over runs."""
     overall = results.overall
-    rows = overall.loc[overall["regime"].isin(["standard", "guided"]) & overall["abs_rec"].notna()]
+    rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
     if not len(rows):
         why = "no model has all four datasets" if len(results.cells) else results.why("cells")
         return not_run_figure("AbsRec, standard and guided", why)
@@ -112,7 +113,7 @@ def abs_rec_by_model(results: Results) -> Figure:
         axes = figure.add_subplot()
         for k, model in enumerate(models):
             colour, marker = look[model]
-            both = [100 * sides[model, r]["abs_rec"] for r in ("standard", "guided") if (model, r) in sides]
+            both = [100 * sides[model, r]["abs_rec"] for r in PROMPTING if (model, r) in sides]
             axes.plot(both, [k] * len(both), color=colour, linewidth=0.9, zorder=2)
             for regime, face in (("standard", "white"), ("guided", colour)):
                 row = sides.get((model, regime))

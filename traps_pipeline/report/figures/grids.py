@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.report.results import Results
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
 from traps_pipeline.scoring import analyses
 
@@ -54,7 +55,7 @@ def _by_model(results: Results, rows: pd.DataFrame) -> list[tuple[str, list[str]
     video = [m for m in analyses.models_of(media="video", group="main") if m in asked]
     models = (video or asked)[:MOST_MODELS]
     panels = []
-    for regime in ("standard", "guided"):
+    for regime in PROMPTING:
         part = cells.loc[(cells["regime"] == regime) & cells["model"].isin(models)]
         if len(part):
             wide = part.pivot(index=["dataset", "scope"], columns="model", values="abs_rec")

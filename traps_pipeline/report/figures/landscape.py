@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.report.figures.labels import LINES, Label, merged_labels, place_labels, short
+from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
+from traps_pipeline.report.figures.label_placement import LINES, Label, merged_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
-from traps_pipeline.report.results import Results, datasets_of
+from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import (
     COLUMN_IN,
@@ -54,7 +55,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}")
         labels = merged_labels(_draw_models(axes, points), axes)
-        guided = points.loc[points["regime"] == "guided"]
+        guided = points.loc[points["regime"] == GUIDED]
         _draw_frontier(axes, guided)
         _draw_rings(axes, guided)
         _draw_key(figure)
@@ -77,13 +78,13 @@ def reasoning(results: Results) -> Figure:
         figure = new_figure(PAGE_IN, 3.5)
         panels = figure.subplots(1, 2, sharey=True)
         labels = [_draw_chains(axes, named.loc[named["regime"] == regime], chains) for axes, regime in
-                  zip(panels, ("standard", "guided"), strict=True)]  # fmt: skip
-        for axes, regime in zip(panels, ("standard", "guided"), strict=True):
+                  zip(panels, PROMPTING, strict=True)]  # fmt: skip
+        for axes, regime in zip(panels, PROMPTING, strict=True):
             frame_plane(axes, named, "Acc, overall")
             axes.set_title(f"{regime} (filled: thinks most)", weight="normal", size=7.5)
         panels[1].set_ylabel("")
         freeze_layout(figure)
-        for axes, names, regime in zip(panels, labels, ("standard", "guided"), strict=True):
+        for axes, names, regime in zip(panels, labels, PROMPTING, strict=True):
             at = named.loc[named["regime"] == regime, ["j", "acc"]].to_numpy(float)
             place_labels(axes, merged_labels(names, axes), at)
     return figure
@@ -98,9 +99,9 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
             regime: (float(j), float(acc))
             for regime, j, acc in zip(*(rows[c] for c in ("regime", "j", "acc")), strict=True)
         }
-        if "standard" in at and "guided" in at:
-            axes.plot(*np.array([at["standard"], at["guided"]]).T, color=colour, linewidth=0, zorder=LINES)
-            arrow(axes, at["standard"], at["guided"], colour)
+        if {*PROMPTING} <= at.keys():
+            axes.plot(*np.array([at[regime] for regime in PROMPTING]).T, color=colour, linewidth=0, zorder=LINES)
+            arrow(axes, at[STANDARD], at[GUIDED], colour)
         styles: dict[str, dict[str, Any]] = {
             "standard": {"s": 20, "marker": marker, "facecolors": "white", "edgecolors": colour, "linewidths": 0.9},
             "guided": {"s": 20, "marker": marker, "facecolors": colour, "edgecolors": colour, "linewidths": 0.9},
@@ -109,7 +110,7 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
         for zorder, (regime, style) in enumerate(styles.items(), start=3):
             if regime in at:
                 axes.scatter(*at[regime], zorder=zorder, clip_on=False, **style)
-        x, y = next(at[r] for r in ("guided", *at) if r in at)
+        x, y = next(at[r] for r in (GUIDED, *at) if r in at)
         mark = f" {INCOMPLETE_MARK}" if bool(rows["incomplete"].fillna(False).astype(bool).any()) else ""
         labels.append(Label(x, y, short(str(model)) + mark, colour))
     return labels

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import DATASETS, REGIMES
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     COUNTED,
     COUNTS,
     DATASET,
@@ -87,7 +88,7 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 def uplift(results: Results) -> list[PrintedTable]:
     """AbsRec under guided and standard (equal weight over datasets), their ratio, and PECS of both."""
-    rows, refused, both = [], [], ("standard", "guided")
+    rows, refused, both = [], [], PROMPTING
     for model, means in marked(results.overall).groupby("model", sort=False):
         sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in both}
         if len(sides) < len(both):
@@ -127,7 +128,7 @@ def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 def naive(results: Results) -> list[PrintedTable]:
     """Cells under guided, by the difference between Acc x AbsRec, which ignores false abstention, and PECS."""
-    cells = results.cells.loc[results.cells["regime"] == "guided"]
+    cells = results.cells.loc[results.cells["regime"] == GUIDED]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
     rows = titled(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))

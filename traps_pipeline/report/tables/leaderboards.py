@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.partitions import DATASETS, REGIMES
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     COUNTS,
     DATASET,
     EPOCH,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.base.partitions import taxonomy_of
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import (
+from traps_pipeline.protocol.datasets import taxonomy_of
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
     DATASET,
     MISSING,
     PECS,

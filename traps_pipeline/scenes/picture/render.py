@@ -47,10 +47,27 @@ def _make_current(width: int, height: int) -> None:
 def gl_version() -> str:
     """What draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by another
     version may differ in single pixels. Only while a Renderer is open."""
-    from OpenGL.GL import GL_VERSION, glGetString
+    from OpenGL.GL import GL_VERSION
 
-    said = glGetString(GL_VERSION)
-    return said.decode(errors="replace") if isinstance(said, bytes) else "an unknown OpenGL"
+    return _gl_text(GL_VERSION)
+
+
+def drawn_by() -> str:
+    """Return OpenGL's version and renderer, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)": both decide pixels.
+
+    Raises RenderingUnavailable.
+    """
+    _make_current(WIDTH * SUPERSAMPLE, HEIGHT * SUPERSAMPLE)
+    from OpenGL.GL import GL_RENDERER
+
+    return f"{gl_version()}, {_gl_text(GL_RENDERER)}"
+
+
+def _gl_text(name: int) -> str:
+    from OpenGL.GL import glGetString
+
+    text = glGetString(name)
+    return text.decode(errors="replace") if isinstance(text, bytes) else "an unknown OpenGL"
 
 
 def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:

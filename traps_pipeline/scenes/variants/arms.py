@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.base.partitions import arms_of, sides_of
+from traps_pipeline.protocol.datasets import arms_of, sides_of
 from traps_pipeline.scenes.certification.certificates import (
     EARLIEST_CUT_S,
     legible_groups,
@@ -115,7 +115,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm; `partitions.arms_of` says which scenarios may have it, `partitions.sides_of` what it asks.
+    """One arm; `protocol.datasets.arms_of` says which scenarios may have it, `protocol.datasets.sides_of` what it asks.
 
     takes_away: the shortcut that it turns against its user. promises: its certificate in words.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.base.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
+from traps_pipeline.protocol.datasets import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
 from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.wording import asked, choices_in

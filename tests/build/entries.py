@@ -1,0 +1,18 @@
+"""Entries that a test adds: a fixture to import."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.models import own
+
+
+@pytest.fixture(autouse=True)
+def nobodys_own() -> Iterator[None]:
+    """Entries that a test adds are forgotten at its end."""
+    yield
+    own.use(own.Own(), Path("none"))
+    own.forget()

@@ -1,0 +1,198 @@
+"""The tables of controls: what stands beside a probe, a direction or a steered answer, so that a claim can fail."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.mechanism.mechanism_rows import Block, Dose, DoseUnit, Extracted, Signs, Steered
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+Share = Annotated[float | None, "share, 0 to 1"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringNullRow(Steered):
+    """The effect of a void direction on its own dataset at the largest dose, ranked among the draws of one null."""
+
+    target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
+    layer: Block
+    unit: DoseUnit
+    dose: Dose
+    side: shared.Side
+    null: Annotated[str, "isotropic, covariance or shuffled; each is orthogonal to the void direction"]
+    effect: Annotated[
+        float, "of the void direction: rise of abstention on controls (+), fall of abstention on voids (-)"
+    ]
+    null_mean: Annotated[float, "the same of the null, mean over draws"]
+    null_lowest: Annotated[float, "lowest draw"]
+    null_highest: Annotated[float, "highest draw"]
+    draws: Annotated[int, "draws of the null"]
+    n_at_least: Annotated[int, "draws whose effect is at least that of the void direction"]
+    p: Annotated[float, "(1 + n_at_least) / (1 + draws), one-sided"]
+    n: Annotated[int, "decided answers steered along the void direction, one per scenario and dataset"]
+    epoch: shared.AnswerEpochs
+
+
+STEERING_NULLS = Table(
+    "steering_nulls",
+    SteeringNullRow,
+    partition_by=(),
+    key=("model", "directions", "regime", "target", "layer", "unit", "dose", "side", "null"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringPecsRow(Steered):
+    """PECS and its parts of a steered model: one path at one dose under one sign policy."""
+
+    source: Annotated[str, "dataset of the direction"]
+    target: Annotated[str, "dataset that was steered"]
+    layer: Block
+    unit: DoseUnit
+    dose: Dose
+    signs: Signs
+    acc: Share
+    false_abs: Share
+    abs_rec: Share
+    j: Annotated[float | None, "abs_rec - false_abs"]
+    pecs: Share
+    degenerate: Annotated[float, "share of answers that are cut off, repetitive, or in another script or language"]
+    n_controls: Annotated[int, "decided answers to controls"]
+    n_voids: Annotated[int, "decided answers to voids"]
+    epoch: shared.AnswerEpochs
+
+
+STEERING_PECS = Table(
+    "steering_pecs",
+    SteeringPecsRow,
+    partition_by=(),
+    key=("model", "directions", "regime", "source", "target", "layer", "unit", "dose", "signs"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeBaselineRow(Extracted):
+    """A figure of the probing protocol on other features than states."""
+
+    features: Annotated[
+        str,
+        "question words, first frame, all frames, length, time stamps, output margin, noise as wide as states, or "
+        "states with the name of another probe than that of `probes`, at the layer that is steered",
+    ]
+    analysis: Annotated[str, "as in probes, but for within and shuffled"]
+    source: Annotated[str, "dataset that was fitted"]
+    target: Annotated[str, "dataset that was scored"]
+    scope: Annotated[str, "as in probes"]
+    value: Annotated[float | None, "AUROC, or the share assigned to void; of noise the mean over draws"]
+    low: Annotated[float | None, "as in probes"]
+    high: Annotated[float | None, "as in probes"]
+    spread: Annotated[float | None, "of noise: standard deviation over draws"]
+    n_voids: Annotated[int, "void items of the target"]
+    n_controls: Annotated[int, "control items of the target"]
+    note: Annotated[str | None, "why there is no figure"]
+
+
+PROBE_BASELINES = Table(
+    "probe_baselines",
+    ProbeBaselineRow,
+    partition_by=("model", "prompt"),
+    key=("features", "analysis", "source", "target", "scope"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateRow(Extracted):
+    """A model's figures on a target before and after a gate: one regime, one kind of features, one source, one
+    threshold."""
+
+    regime: Annotated[str, "system prompt of the answers that are gated"]
+    features: Annotated[
+        str, "states, or a control: a raw input, output margin, shuffled labels (of states) or untrained model"
+    ]
+    source: Annotated[str, "one:DATASET, other datasets (all but the target) or other families"]
+    threshold: Annotated[str, "mid, J or conformal"]
+    target: Annotated[
+        str, "dataset; all: mean over the four; or items without a pair, of which false_abs alone is known"
+    ]
+    layer: Annotated[int, "of the states, chosen by the sources' own cross-validation; -1 for other features"]
+    auroc: Annotated[float | None, "of the gate's scores on the target"]
+    acc: Share
+    false_abs: Share
+    abs_rec: Share
+    pecs: Share
+    pecs_low: Annotated[float | None, "95 % percentile interval from resampled scenarios, the gate held fixed"]
+    pecs_high: Annotated[float | None, "95 % percentile interval from resampled scenarios, the gate held fixed"]
+    plain_acc: Annotated[float | None, "without the gate"]
+    plain_false_abs: Annotated[float | None, "without the gate"]
+    plain_abs_rec: Annotated[float | None, "without the gate"]
+    plain_pecs: Annotated[float | None, "without the gate"]
+    expected_false_abs: Annotated[float | None, "share of the source's unseen controls above the threshold"]
+    n_controls: Annotated[int, "control items of the target"]
+    n_voids: Annotated[int, "void items of the target"]
+
+
+GATE = Table(
+    "gate",
+    GateRow,
+    partition_by=("model", "prompt"),
+    key=("regime", "features", "source", "threshold", "target"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskCoverageRow(Extracted):
+    """A point of the curve along which a gate gives up answers, from the riskiest on, over the four datasets."""
+
+    regime: Annotated[str, "system prompt of the answers"]
+    features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
+    coverage: Annotated[float, "share of items that are answered"]
+    risk: Annotated[float, "share of these answers that are wrong; every answer to a void is"]
+    n: Annotated[int, "answers"]
+
+
+RISK_COVERAGE = Table(
+    "risk_coverage",
+    RiskCoverageRow,
+    partition_by=("model", "prompt"),
+    key=("regime", "features", "coverage"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchingRow(Extracted):
+    """The indirect effect of a group of positions at one site and layer, over the pairs of a dataset."""
+
+    dataset: shared.Dataset
+    into: Annotated[str, "side whose pass is changed: control (towards its void) or void (towards its control)"]
+    source: Annotated[
+        str,
+        "where the patch comes from: pair (the other side), or a null: other scenario (another scenario's other side), "
+        "same side (another scenario's same side) or other times (the item's own frames with the other side's times)",
+    ]
+    site: Annotated[str, "residual (as it leaves the block), attention or mlp (their outputs)"]
+    layer: Annotated[int, "counted as in hidden_states"]
+    group: Annotated[
+        str,
+        "system, stamps, changed (visual tokens whose pixels differ between the sides), unchanged, question, last, "
+        "or all",
+    ]
+    effect: Annotated[
+        float | None, "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it"
+    ]
+    low: Annotated[float | None, "95 % percentile interval from resampled scenarios"]
+    high: Annotated[float | None, "95 % percentile interval from resampled scenarios"]
+    flips: Annotated[
+        float | None, "share of pairs whose sides differ in the sign of the outcome in which the patch changes the sign"
+    ]
+    n_flippable: Annotated[int, "such pairs"]
+    n: Annotated[int, "pairs"]
+    n_left_out: Annotated[int, "pairs whose prompts have another form, or no such source"]
+    tokens: Annotated[float, "tokens of the group, mean over pairs"]
+
+
+PATCHING = Table(
+    "patching",
+    PatchingRow,
+    partition_by=("model", "prompt"),
+    key=("dataset", "into", "source", "site", "layer", "group"),
+)

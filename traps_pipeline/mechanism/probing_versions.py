@@ -1,0 +1,102 @@
+"""The versions of settings, prompts and precision that the mechanistic stages depend on. Nothing here needs torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.tables import VIDEOS
+from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS
+from traps_pipeline.mechanism.transfer_paths import CURVES
+from traps_pipeline.models.local.capture import OF_PAIRS
+from traps_pipeline.models.prompts import states_prompt, system_prompt
+from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
+from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.storage.media import profile_digest
+from traps_pipeline.storage.study import ACTING
+from traps_pipeline.storage.workspace import Workspace
+
+SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
+
+
+def loaded_params(entry: ModelEntry) -> dict[str, Any]:
+    """The parameters of a local model that its states depend on: those of its entry without sampling, in the precision
+    in which states are read."""
+    inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
+    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
+    skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
+    return params | {"quantisation": inside.quantisation} | skipped
+
+
+def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
+    """The folder of a partition's shards."""
+    return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
+
+
+def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
+    """Whether the extraction of a partition was finished and all of its files still exist."""
+    from traps_pipeline.storage.parquet import read_sealed
+
+    folder = states_folder(workspace, cell)
+    try:
+        shards = set(read_sealed(workspace.store.here(folder / "ids.parquet"))["shard"].to_pylist())
+    except (OSError, ValueError, KeyError, TrapsError):
+        return False
+    files = {folder / f"{shard}{ending}" for shard in shards for ending in (".safetensors", ".parquet")}
+    return workspace.store.sizes(files).keys() == files
+
+
+def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
+    """Whether all files in the directions table of an extraction exist."""
+    paths = {workspace.root / path for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
+    files = paths | {path.with_suffix(".json") for path in paths}
+    return workspace.store.sizes(files).keys() == files
+
+
+def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
+    """Digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt, pooling."""
+    entry, settings = get_model(extraction.model), workspace.study.mechanism
+    media = profile_digest(entry.media) if entry.media else None
+    pooling = settings.pooling if settings else None
+    system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
+    made_of = [loaded_params(entry), media, system, pooling]
+    if pooling in OF_PAIRS:  # an item's states depend on the other clip of its scenario, which is not in its own table
+        made_of.append(sorted(workspace.tables.read_all(VIDEOS, ["file_sha256"])["file_sha256"]))
+    return digest(made_of)[:16]
+
+
+def probing_version(workspace: Workspace, extraction: Extraction) -> str:
+    """Digest of the study's settings for the probes and directions of a model."""
+    settings = workspace.study.mechanism
+    if settings is None or extraction.model not in settings.models:
+        return "none"
+    steering = settings.steering
+    pairs: list[Any] = [steering.well_posed_pairs, steering.ill_posed_pairs, steering.pairs] if steering else []
+    if steering and steering.nulls:
+        pairs.append(steering.nulls.model_dump(mode="json"))
+    layers = settings.models[extraction.model]
+    gate = settings.gate.model_dump(mode="json")
+    return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES, gate])[:16]
+
+
+def patching_version(workspace: Workspace, extraction: Extraction) -> str:
+    """Digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
+    settings = workspace.study.mechanism
+    if settings is None or settings.patching is None or extraction.model not in settings.models:
+        return "none"
+    chosen = settings.patching.model_dump(mode="json"), settings.seed
+    return digest([extraction_version(workspace, extraction), *chosen])[:16]
+
+
+def steering_version(workspace: Workspace, run: str) -> str:
+    """Digest of the inputs of steered answers besides items and directions: the study's settings, model and prompt."""
+    model, _, regime = run.split("__")
+    entry, settings = get_model(model), workspace.study.mechanism
+    if settings is None or settings.steering is None or model not in settings.models:
+        return "none"
+    steering = settings.steering.model_dump(mode="json", exclude=set(ACTING)) | settings.steering.acting
+    chosen = steering, settings.models[model].model_dump(mode="json"), settings.seed
+    media = profile_digest(entry.media) if entry.media else None
+    return digest([*chosen, loaded_params(entry), media, system_prompt(regime)])[:16]

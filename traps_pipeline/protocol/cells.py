@@ -1,0 +1,170 @@
+"""Keys of cells, evaluations and extractions: how they are formatted, parsed and checked.
+
+Dagster allows two partition dimensions, sorts them by name, and forbids `|`, `,`, `[` and `]` inside a key.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from traps_pipeline.base.names import check_name
+from traps_pipeline.protocol.datasets import BESIDE, DATASETS, PROBED_DATASETS
+from traps_pipeline.protocol.regimes import REGIMES, VQA_PROMPTS
+
+_EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
+
+
+@dataclass(frozen=True, order=True)
+class Evaluation:
+    """One model under one regime in one run: the second partition dimension of the paid stages."""
+
+    model: str
+    regime: str
+    run: int
+
+    @property
+    def key(self) -> str:
+        """`model__regime__runN`."""
+        return f"{self.model}__{self.regime}__run{self.run}"
+
+    @staticmethod
+    def parse(key: str) -> Evaluation:
+        """Inverse of `key`. Raises ValueError naming what is wrong."""
+        found = _EVALUATION.fullmatch(key)
+        if found is None or found["regime"] not in REGIMES:
+            raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
+        return Evaluation(check_name(found["model"]), found["regime"], int(found["run"]))
+
+
+@dataclass(frozen=True, order=True)
+class Cell:
+    """One dataset under one evaluation: a partition of responses, votes and verdicts."""
+
+    dataset: str
+    evaluation: Evaluation
+
+    @property
+    def key(self) -> str:
+        """The partition key as Dagster writes it: dimensions sorted by name (`dataset` before `evaluation`)."""
+        return f"{self.dataset}|{self.evaluation.key}"
+
+    @property
+    def partition(self) -> dict[str, Any]:
+        """Values of the tables' partition columns."""
+        e = self.evaluation
+        return {"dataset": self.dataset, "model": e.model, "regime": e.regime, "run": e.run}
+
+    @staticmethod
+    def parse(key: str) -> Cell:
+        """Inverse of `key`. Raises ValueError."""
+        dataset, _, evaluation = key.partition("|")
+        if dataset not in (*DATASETS, *BESIDE):
+            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *BESIDE)}")
+        return Cell(dataset, Evaluation.parse(evaluation))
+
+
+# --- inside local models ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, order=True)
+class Extraction:
+    """One local model under one VQA prompt: the partition of probes and directions."""
+
+    model: str
+    prompt: str
+
+    @property
+    def key(self) -> str:
+        """`model__prompt`."""
+        return f"{self.model}__{self.prompt}"
+
+    @property
+    def partition(self) -> dict[str, Any]:
+        """Values of the tables' partition columns."""
+        return {"model": self.model, "prompt": self.prompt}
+
+    @staticmethod
+    def parse(key: str) -> Extraction:
+        """Inverse of `key`. Raises ValueError naming what is wrong."""
+        model, _, prompt = key.partition("__")
+        if prompt not in VQA_PROMPTS:
+            raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
+        return Extraction(check_name(model), prompt)
+
+
+@dataclass(frozen=True, order=True)
+class StatesCell:
+    """One dataset under one extraction: a partition of hidden_states."""
+
+    dataset: str
+    extraction: Extraction
+
+    @property
+    def key(self) -> str:
+        """The partition key as Dagster writes it."""
+        return f"{self.dataset}|{self.extraction.key}"
+
+    @property
+    def partition(self) -> dict[str, Any]:
+        """Values of the tables' partition columns."""
+        return {"dataset": self.dataset, **self.extraction.partition}
+
+    @staticmethod
+    def parse(key: str) -> StatesCell:
+        """Inverse of `key`. Raises ValueError."""
+        dataset, _, extraction = key.partition("|")
+        if dataset not in PROBED_DATASETS:
+            raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {PROBED_DATASETS}")
+        return StatesCell(dataset, Extraction.parse(extraction))
+
+
+class SteeredEvaluation(Evaluation):
+    """A model that is steered while it answers under a regime. Its ledger holds all directions: what is not steered
+    (alpha 0) is one answer for all of them."""
+
+    @property
+    def key(self) -> str:
+        """`model__regime__steered`: the ledger's folder."""
+        return f"{self.model}__{self.regime}__steered"
+
+
+@dataclass(frozen=True, order=True)
+class SteeringCell(Cell):
+    """One target dataset under directions of one VQA prompt and answers under one regime: a partition of steering."""
+
+    directions: str
+
+    @property
+    def run(self) -> str:
+        """`model__directionregime__inferenceregime`."""
+        return f"{self.evaluation.model}__{self.directions}__{self.evaluation.regime}"
+
+    @property
+    def key(self) -> str:
+        """The partition key as Dagster writes it."""
+        return f"{self.dataset}|{self.run}"
+
+    @property
+    def partition(self) -> dict[str, Any]:
+        """Values of the tables' partition columns."""
+        e = self.evaluation
+        return {"dataset": self.dataset, "model": e.model, "directions": self.directions, "regime": e.regime}
+
+    @staticmethod
+    def make(dataset: str, model: str, directions: str, regime: str) -> SteeringCell:
+        """The cell of these."""
+        return SteeringCell(dataset, SteeredEvaluation(model, regime, 1), directions)
+
+    @staticmethod
+    def parse(key: str) -> SteeringCell:
+        """Inverse of `key`. Raises ValueError."""
+        dataset, _, run = key.partition("|")
+        parts = run.split("__")
+        # A graph has a key of each dataset of its study, arms too; only those of the pairs are ever wanted.
+        if dataset not in (*DATASETS, *BESIDE) or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
+            raise ValueError(
+                f"steering key {key!r} is not dataset|model__directions__regime with regimes of {VQA_PROMPTS}"
+            )
+        return SteeringCell.make(dataset, check_name(parts[0]), parts[1], parts[2])

@@ -1,0 +1,103 @@
+"""Datasets, arms and variations: their names, their sides, and the categories that they draw on."""
+
+from __future__ import annotations
+
+OCCLUSION_CATEGORIES = (
+    "ramps_rolling",
+    "pendulums_levers",
+    "trajectories_drops",
+    "hidden",
+    "collisions",
+    "dominoes",
+    "stacks",
+    "other",
+)
+CHAOTIC_CATEGORIES = ("pachinko_waterfall", "plinko", "seesaw_sorter", "tumbling_dice")
+CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
+# Domains beside the benchmark's: each has a benchmark of its own (`scene_specs/extensions/`), whose voids are made by a
+# panel, as those of occlusion are. No study of the benchmark has one, nor has any number of the paper.
+EXTENSION_CATEGORIES = ("soft_bodies",)
+ALL_CATEGORIES = CATEGORIES + EXTENSION_CATEGORIES
+
+DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
+SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
+LONG = {short: dataset for dataset, short in SHORT.items()}
+# Datasets beside the pairs, each of which takes one shortcut away (docs/arms.md). No part of PECS; asked on request.
+ANSWERABLE_ARMS = ("decoy", "removed", "late_panel", "length_matched", "predictable_cut", "twin_control")
+VOID_ARMS = ("frame_out", "held_void")
+PAIRED_ARMS = ("choices_swapped",)  # has controls and voids
+ARMS = (*ANSWERABLE_ARMS, *VOID_ARMS, *PAIRED_ARMS)
+# Datasets that change one thing of the pairs, step by step, for what the paper supposes and did not measure
+# (docs/hypotheses.md). No part of PECS or of PECS-R; asked on request.
+LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
+PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_large", "panel_alpha_95")  # still voids
+PANEL_DOSES = ("panel_alpha_80", "panel_alpha_50")  # the panel lets the outcome through: no voids
+SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
+FRAMINGS = ("frames_later", "frames_few", "frames_all")
+VARIATIONS = (*LABEL_DOSES, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
+BESIDE = (*ARMS, *VARIATIONS)  # all that is no dataset of the pairs
+_ONE_TAXONOMY = {
+    **dict.fromkeys(("decoy", "removed", "late_panel", "frame_out", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
+    **dict.fromkeys(("length_matched", "predictable_cut", "held_void"), "chaotic"),
+}
+ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
+TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each side's frames with the other's times
+PROBED_ARMS = ("decoy", "length_matched")  # arms that probes are applied to where an experiment asks them
+PROBED_DATASETS = (*DATASETS, ANSWERABLE, TIME_SWAPPED, *PROBED_ARMS)
+SIDES = ("control", "void")
+
+
+def taxonomy_of(dataset: str) -> str:
+    """`occlusion` or `chaotic`."""
+    return dataset.removesuffix("_ill_posed")
+
+
+def is_ill_posed(dataset: str) -> bool:
+    """Whether the void of a pair is the control's clip with an unanswerable question."""
+    return dataset.endswith("_ill_posed")
+
+
+def transfer_type(source: str, target: str) -> str:
+    """What a path between datasets crosses (docs/spec.md 7.2): modality of the void, domain, both or neither."""
+    domain = taxonomy_of(source) != taxonomy_of(target)
+    modality = is_ill_posed(source) != is_ill_posed(target)
+    return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
+        (domain, modality), "Within"
+    )
+
+
+def taxonomy_of_category(category: str) -> str:
+    """`occlusion` or `chaotic`."""
+    return "chaotic" if category in CHAOTIC_CATEGORIES else "occlusion"
+
+
+def datasets_of_category(category: str) -> tuple[str, str]:
+    """The two datasets (visual, ill-posed) that a category's scenarios belong to."""
+    taxonomy = taxonomy_of_category(category)
+    return taxonomy, f"{taxonomy}_ill_posed"
+
+
+def arms_of(taxonomy: str) -> tuple[str, ...]:
+    """The arms that scenarios of a taxonomy may have."""
+    return tuple(arm for arm in beside_of(taxonomy) if arm in ARMS)
+
+
+def beside_of(taxonomy: str) -> tuple[str, ...]:
+    """The arms and variations that scenarios of a taxonomy may have."""
+    return tuple(name for name in BESIDE if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
+
+
+def all_datasets_of(category: str) -> tuple[str, ...]:
+    """Everything that a category's scenarios are asked in."""
+    return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
+
+
+def dataset_of(item_id: str) -> str:
+    """The dataset of an item, by its id `dataset:scenario:side`."""
+    return item_id.partition(":")[0]
+
+
+def sides_of(dataset: str) -> tuple[str, ...]:
+    """The sides that a dataset, an arm or a variation asks of each scenario."""
+    controls, voids = (*ANSWERABLE_ARMS, *PANEL_DOSES), (*VOID_ARMS, *PANEL_LOOKS)
+    return {**dict.fromkeys(controls, ("control",)), **dict.fromkeys(voids, ("void",))}.get(dataset, SIDES)

@@ -1,0 +1,41 @@
+"""Regimes: the system prompts under which models answer, each with its texts and the form of its answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Regime:
+    """A way of asking. Its texts are files of `assets/prompts`, joined by one blank line.
+
+    fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
+    read (docs/spec.md 7.1); none: no states are read under this regime.
+    """
+
+    name: str
+    texts: tuple[str, ...]
+    fields: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+
+
+# To add a regime, add an entry here and its texts in `assets/prompts`; a name is of lower-case letters.
+BY_NAME: Mapping[str, Regime] = {
+    regime.name: regime
+    for regime in (
+        Regime("standard", ("standard",), states=("vqa_standard",)),
+        Regime("guided", ("standard", "guided_suffix"), states=("vqa_standard", "vqa_guided_suffix")),
+        Regime("json", ("standard", "json_suffix"), fields=("reason", "final_answer")),
+    )
+}
+REGIMES = tuple(BY_NAME)
+VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)
+# The paper compares answers under these two: the plain prompt, and the one that permits an abstention.
+STANDARD, GUIDED = PROMPTING = ("standard", "guided")
+PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
+
+
+def one_of(names: tuple[str, ...]) -> str:
+    """Return the names as an English list, for a sentence about a column."""
+    return f"{', '.join(names[:-1])} or {names[-1]}"

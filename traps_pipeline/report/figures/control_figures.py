@@ -1,0 +1,288 @@
+"""What settles mechanistic claims: probes and baselines, the gate in the PECS plane, patching, doses among nulls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.mechanism.directions import NULLS
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.report.figures.looks import arrow, frame_plane
+from traps_pipeline.report.result_frames import Results, datasets_of
+from traps_pipeline.report.tables.control_reports import beside
+from traps_pipeline.report.tables.patching_tables import SITES
+from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
+from traps_pipeline.report.tables.steering_tables import few, why
+from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.writing import (
+    COLOURS,
+    GRID,
+    INK,
+    PAGE_IN,
+    SOFT,
+    figure_style,
+    fraction,
+    new_figure,
+    not_run_figure,
+    plain,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BASELINES = dict(zip((*SHORTCUTS, "output margin"), ("s", "^", "v", "D", "P", "X"), strict=True))
+_FEATURES = ("states", "question words", "time stamps", "output margin", "shuffled labels", "untrained model")
+GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
+
+
+def probe_baselines(results: Results) -> Figure:
+    """AUROC of each dataset's probe on itself and on the other datasets (black, with its interval) beside probes on raw
+    inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations. oc and ch are
+    occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch; † is from
+    fewer than ten items a side. A probe shows what the states add only as far as it is above all coloured marks."""
+    rows = beside(results)
+    if not len(rows):
+        return not_run_figure("Probes and their baselines", why(results), PAGE_IN)
+    from matplotlib.lines import Line2D
+
+    models = list(dict.fromkeys(rows["model"]))
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.9 + 2.4 * len(models))
+        axes = figure.subplots(len(models), 1, squeeze=False, sharex=True)[:, 0]
+        for ax, model in zip(axes, models, strict=True):
+            _baselines(ax, rows.loc[rows["model"] == model])
+            sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
+            ax.set_title(f"{plain(model)[:40]}, {_from_to(sides.min(), sides.max())} items a side", size=7.5)
+            ax.set_ylabel("AUROC")
+        handles = [Line2D([], [], color=INK, marker="o", markersize=4, label="states, at the source’s own layer")]
+        handles += [
+            Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=4, label=name)
+            for (name, marker), colour in zip(_BASELINES.items(), COLOURS, strict=False)
+        ]
+        handles += [Line2D([], [], color=GRID, linewidth=6, label="noise, mean ± 2 sd")]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _from_to(low: int, high: int) -> str:
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
+    order = [(s, t) for s in DATASETS for t in sorted(DATASETS, key=lambda t: (t != s, DATASETS.index(t)))]
+    found = {(row["source"], row["target"]): row for row in rows.to_dict("records")}
+    shown = [pair for pair in order if pair in found]
+    for x, pair in enumerate(shown):
+        row = found[pair]
+        if row["noise_spread"] == row["noise_spread"]:
+            low, high = row["noise"] - 2 * row["noise_spread"], row["noise"] + 2 * row["noise_spread"]
+            ax.plot([x, x], [max(low, 0), min(high, 1)], color=GRID, linewidth=7, solid_capstyle="butt", zorder=1)
+        for k, ((name, marker), colour) in enumerate(zip(_BASELINES.items(), COLOURS, strict=False)):
+            ax.plot(x + 0.09 * (k - 2.5) + 0.07, row[name], marker=marker, color=colour, markersize=3, linestyle="none")
+        ax.plot([x - 0.32, x - 0.32], [row["low"], row["high"]], color=INK, linewidth=0.8)
+        ax.plot(x - 0.32, row["value"], marker="o", color=INK, markersize=3.5)
+    ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
+    names = ["itself" if s == t else f"{SHORT[s]}→{SHORT[t]}" for s, t in shown]
+    names = [SHORT[s] if s == t else n for n, (s, t) in zip(names, shown, strict=True)]
+    marked = [f"{name} {found[pair]['mark']}".strip() for name, pair in zip(names, shown, strict=True)]
+    ax.set_xticks(range(len(shown)), marked)
+    ax.tick_params(axis="x", labelrotation=60, length=0)
+    ax.set_ylim(-0.03, 1.05)
+
+
+def gate_arrows(results: Results) -> Figure:
+    """Each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates on
+    states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
+    AbsRec less FalseAbs: an arrow to the right tells voids from controls better, an arrow downwards pays for it with
+    right answers."""
+    rows = results.gate
+    rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
+    rows = rows.loc[rows["features"].isin(_FEATURES)]
+    if not len(rows):
+        absent = why(results) if results.is_study else "the paper gates nothing"
+        return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
+    from matplotlib.lines import Line2D
+
+    regimes = [name for name in PROMPTING if name in set(rows["regime"])]
+    colour = _colours(_FEATURES)
+    rows = rows.assign(j=rows["abs_rec"] - rows["false_abs"], plain_j=rows["plain_abs_rec"] - rows["plain_false_abs"])
+    with figure_style():
+        figure = new_figure(PAGE_IN, 3.6)
+        panels = figure.subplots(1, len(regimes) + 1, squeeze=False)[0]
+        for ax, regime in zip(panels, regimes, strict=False):
+            part = rows.loc[rows["regime"] == regime]
+            _arrows(ax, part, colour)
+            ax.set_title(f"{regime}, {plain(' and '.join(dict.fromkeys(part['model'])))[:30]}", size=7.5)
+        _risk(panels[-1], results.risk_coverage, regimes[-1], colour)
+        handles = [Line2D([], [], color=colour[f], marker="o", markersize=4, label=f"gate on {f}") for f in
+                   _FEATURES if f in set(rows["features"])]  # fmt: skip
+        handles += [Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="none", label="no gate")]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _colours(names: Sequence[str]) -> dict[str, str]:
+    return dict(zip(names, COLOURS, strict=False))
+
+
+def _arrows(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
+    import pandas as pd
+
+    points = pd.DataFrame({"acc": [*rows["acc"], *rows["plain_acc"]], "j": [*rows["j"], *rows["plain_j"]]})
+    frame_plane(ax, points, "Acc, overall")
+    for row in rows.to_dict("records"):
+        start, end = (row["plain_j"], row["plain_acc"]), (row["j"], row["acc"])
+        arrow(ax, start, end, colour[row["features"]])
+        ax.scatter(*end, s=16, color=colour[row["features"]], zorder=4, clip_on=False)
+        ax.scatter(*start, s=22, facecolors="white", edgecolors=INK, linewidths=0.9, zorder=5, clip_on=False)
+
+
+def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> None:
+    rows = rows.loc[rows["regime"] == regime]
+    for features, curve in rows.groupby("features", sort=False):
+        curve = curve.sort_values("coverage")
+        if features == "no gate":
+            ax.scatter(curve["coverage"], curve["risk"], s=22, facecolors="white", edgecolors=INK, zorder=4)
+        elif features in colour:
+            ax.plot(curve["coverage"], curve["risk"], color=colour[str(features)], linewidth=1.1)
+    ax.set(xlabel="coverage: share answered", ylabel="risk: share of answers that are wrong", xlim=(0, 1))
+    ax.set_ylim(-0.02, max(0.5, *rows["risk"]) + 0.05 if len(rows) else 1)
+    ax.set_title(f"risk and coverage, {regime}", size=7.5)
+
+
+def patching(results: Results) -> Figure:
+    """Indirect effect of each group of positions at each layer, for patches from the void into the control and back; 1
+    is the whole difference of the outcome. The residual stream is all that a block hands on; attention and MLP, where
+    they were patched, are what one block adds to it. stamps are the time stamps, changed and unchanged
+    the visual tokens whose pixels differ between the sides and those whose pixels do not; last is the last token."""
+    rows = results.patching
+    rows = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()]
+    if not len(rows):
+        absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
+        return not_run_figure("Activation patching", absent, PAGE_IN)
+    sites = [site for site in SITES if site in set(rows["site"])]
+    cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
+    alone = len(sites) == 1  # then cases stand side by side; else a line has the sites of one case
+    across = min(2, len(cases)) if alone else len(sites)
+    panels = [(case, site) for case in cases for site in sites]
+    lines = -(-len(panels) // across)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.3 + 1.9 * lines)
+        axes = figure.subplots(lines, across, squeeze=False)
+        images = []
+        for place, (ax, ((model, dataset, into), site)) in enumerate(zip(axes.flat, panels, strict=False)):
+            chosen = (rows["model"] == model) & (rows["dataset"] == dataset) & (rows["into"] == into)
+            part = rows.loc[chosen & (rows["site"] == site)]
+            if not len(part):
+                ax.set_axis_off()
+                continue
+            images.append(_effects(ax, part))
+            n = int(part["n"].max())
+            if alone:
+                ax.set_title(f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}, {n} pairs", size=7)
+                continue
+            if place < across:
+                ax.set_title(SITES[site], size=7.5)
+            if place % across == 0:
+                ax.set_ylabel(f"{plain(model)[:20]}: {TITLES[dataset].lower()},\ninto the {into}, {n} pairs", size=7)
+        for ax in axes.flat[len(panels) :]:
+            ax.set_axis_off()
+        figure.colorbar(images[-1], ax=list(axes.flat), label="indirect effect", shrink=0.8, aspect=25, pad=0.01)
+    return figure
+
+
+def _effects(ax: Axes, part: pd.DataFrame) -> Any:
+    wide = part.pivot_table(index="group", columns="layer", values="effect", observed=True).reindex([*GROUPS])
+    wide = wide.dropna(how="all")
+    values = wide.to_numpy(float)
+    image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
+    ax.set_xticks(range(values.shape[1]), [str(layer) for layer in wide.columns])
+    ax.set_yticks(range(len(wide)), [str(name) for name in wide.index])
+    ax.set_xlabel("layer (0: embeddings)")
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    if values.shape[1] <= 12:
+        for (row, column), value in np.ndenumerate(values):
+            if value == value:
+                shade = "white" if abs(value) > 0.6 else "black"
+                ax.text(column, row, fraction(value, 2), ha="center", va="center", size=6, color=shade)
+    return image
+
+
+def doses_among_nulls(results: Results) -> Figure:
+    """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
+    gap. Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
+    and subtracted on voids (−); a larger dot stands for more draws. The direction does something of its own where its
+    line ends away from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions. n:
+    answers of a side, † fewer than ten. p: share of the draws of each null, in the order of the legend, that do as
+    much, the direction itself counted with them; on controls, then on voids."""
+    rows = results.own_effects
+    if not len(rows):
+        absent = why(results) if results.is_study else "the paper has no such nulls"
+        return not_run_figure("Doses among nulls", absent, PAGE_IN)
+    from matplotlib.lines import Line2D
+
+    cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
+    datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.7 + 2.0 * len(cells))
+        axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True, sharex=True)
+        for line, (model, directions, regime) in zip(axes, cells, strict=True):
+            of = rows.loc[(rows["model"] == model) & (rows["directions"] == directions) & (rows["regime"] == regime)]
+            for ax, dataset in zip(line, datasets, strict=True):
+                part = of.loc[of["target"] == dataset]
+                _dose(ax, part, colour)
+                own = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
+                n = _from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
+                ranks = _p_values(results.nulls, str(model), str(directions), str(regime), dataset)
+                ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
+            line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
+        for ax in axes[-1]:
+            ax.set_xlabel("dose in class gaps | nulls", size=7)
+        axes[0, 0].set_ylim(-6, 106)
+        handles = [Line2D([], [], color=INK, marker="o", markersize=3.5, label="+ on controls")]
+        handles += [Line2D([], [], color=SOFT, marker="s", markersize=3.5, linestyle="--", label="− on voids")]
+        handles += [
+            Line2D([], [], linestyle="none", marker="o", markersize=3, color=colour[null], label=f"{null} null")
+            for null in NULLS
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=5)
+    return figure
+
+
+def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
+    """The p of a direction among each of its nulls at the largest dose, a line a side."""
+    of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
+    of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
+    said: list[str] = []
+    for side, sign in (("control", "+"), ("void", "−")):
+        rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
+        known = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
+        said += [f"p {sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
+    return said
+
+
+def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
+    # Doses in alpha have a figure of their own; a gap may be so small that they would set the scale of this one.
+    rows = rows.loc[rows["unit"] == "gap"]
+    for side, line, marker, ink in (("control", "-", "o", INK), ("void", "--", "s", SOFT)):
+        of = rows.loc[rows["side"] == side]
+        void = of.loc[of["kind"] == "void"].sort_values("gaps").drop_duplicates("gaps")
+        ax.plot(void["gaps"], 100 * void["abstention"].astype(float), color=ink, linestyle=line, marker=marker,
+                markersize=3.2, linewidth=1.0, clip_on=False)  # fmt: skip
+        for place, null in enumerate(NULLS):
+            drawn = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
+            if not len(drawn):
+                continue
+            top = float(drawn["gaps"].iloc[0])
+            at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
+            counts = (100 * drawn["abstention"].astype(float)).round(6).value_counts()
+            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
+                       marker=marker, linewidths=0, clip_on=False)  # fmt: skip
+            ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
+            ax.set_xticks([0, top / 2, top, 1.39 * top, 1.94 * top], ["0", f"{top / 2:g}", f"{top:g}", "+", "−"])

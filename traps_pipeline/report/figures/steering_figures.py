@@ -1,0 +1,268 @@
+"""Probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
+from traps_pipeline.protocol.datasets import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.probe_tables import best_layers
+from traps_pipeline.report.tables.steering_tables import why
+from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+# A source has a colour and a line style, a target a marker, so that they differ without colour as well.
+COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
+LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
+MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
+FAMILY_COLOUR = {"occlusion": "#0072B2", "chaotic": "#C8102E"}  # of directions, in dose and response
+# The paper draws four key paths and does not name them. These cross the domains onto visual voids.
+KEY_PATHS = [(s, t) for s, t in TRANSFER if taxonomy_of(s) != taxonomy_of(t) and not is_ill_posed(t)]
+COSINE_SCALE = 0.6  # of the paper's heatmaps
+CROSSING = TRANSFER_TYPES[:3]
+SETS = {"transfer": "transfer", "within_domain": "within"}
+
+
+def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) -> None:
+    """Sources by colour and line, targets by marker, below the panels."""
+    from matplotlib.lines import Line2D
+
+    sources = [Line2D([], [], color=colours[d], linestyle=LINE[d], label=f"from {SHORT[d]}") for d in DATASETS]
+    targets = [
+        Line2D([], [], color=SOFT, linestyle="none", marker=MARKER[d], markersize=3.5, label=f"to {SHORT[d]}")
+        for d in DATASETS
+    ]
+    handles = [*sources, *targets, *more]
+    style: dict[str, Any] = {"columnspacing": 1.0, "handlelength": 2.0, "handletextpad": 0.4}
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(8, -(-len(handles) // 2)), **style)
+
+
+def _key(label: str, face: str) -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=SOFT, linestyle="none", marker="o", markersize=4, markerfacecolor=face, label=label)
+
+
+def _chance_key() -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=SOFT, linewidth=0.8, linestyle=(0, (4, 2.5)), label="chance")
+
+
+def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=color, linewidth=width, solid_capstyle="butt", label=label)
+
+
+def probe_curves(results: Results) -> Figure:
+    """AUROC by layer of the twelve ordered pairs, with a row per model and a column per transfer type. The band shows
+    label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the source's own
+    layer."""
+    rows = results.probes
+    curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
+    if not len(curves):
+        return not_run_figure("Probe transfer by layer", why(results), PAGE_IN)
+    models = list(dict.fromkeys(curves["model"]))
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.65 + 1.75 * len(models))
+        axes = figure.subplots(len(models), 3, sharey=True, squeeze=False)
+        for line, model in zip(axes, models, strict=True):
+            for ax, crossing in zip(line, CROSSING, strict=True):
+                _curves(ax, curves.loc[curves["model"] == model], crossing)
+                _shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
+                ax.set_title(f"{plain(model)[:24]}: {crossing}", size=7.5)
+            line[0].set_ylabel("AUROC on the target")
+        for ax in axes[-1]:
+            ax.set_xlabel("layer (0: embeddings)")
+        axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
+        shuffled = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
+        _legend(figure, _key("source’s own layer", "white"), shuffled)
+    return figure
+
+
+def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    for key, curve in curves.groupby(["source", "target"], sort=False):
+        source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
+        if transfer_type(source, target) != crossing:
+            continue
+        curve = curve.sort_values("layer")
+        every = max(1, len(curve) // 8)
+        style: dict[str, Any] = {"color": COLOUR[source], "marker": MARKER[target], "markersize": 3.2}
+        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": every}
+        ax.plot(curve["layer"], curve["value"], **line)
+        chosen = curve.loc[curve["source_best"]]
+        style |= {"markersize": 5, "markerfacecolor": "white", "linestyle": "none"}
+        ax.plot(chosen["layer"], chosen["value"], **style)
+    ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
+    if not len(rows) or rows.loc[:, "layer"].isna().any():
+        return
+    at = rows.groupby("layer").agg(mean=("value", "mean"), spread=("spread", "mean"))
+    low, high = at["mean"] - 2 * at["spread"], at["mean"] + 2 * at["spread"]
+    ax.fill_between(at.index.to_numpy(float), low, high, color=GRID, alpha=0.5, linewidth=0, zorder=0.2)
+
+
+def confabulated_strip(results: Results) -> Figure:
+    """AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls (filled), both
+    at the best layer of all samples; the bar is the median of the model's filled markers, the dashed line is chance."""
+    rows = best_layers(results.probes)
+    if not len(rows) or rows.loc[:, "cf_value"].isna().all():
+        absent = "no dataset has confabulated voids" if len(rows) else why(results)
+        return not_run_figure("Cf→Cf probes", absent, PAGE_IN)
+    models = list(dict.fromkeys(rows["model"]))
+    with figure_style():
+        figure = new_figure(PAGE_IN, 2.5)
+        axes = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
+        for ax, model in zip(axes, models, strict=True):
+            _strip(ax, rows.loc[rows["model"] == model])
+            ax.set_title(plain(model)[:30], size=7.5)
+        lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
+        axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
+        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT), _bar_key("median of Cf→Cf"), _chance_key())
+    return figure
+
+
+def _strip(ax: Axes, rows: pd.DataFrame) -> None:
+    for place, crossing in enumerate(CROSSING):
+        part = rows.loc[rows["transfer_type"] == crossing]
+        for k, row in enumerate(part.to_dict("records")):
+            x = place + 0.19 * (k - (len(part) - 1) / 2)
+            style: dict[str, Any] = {"color": COLOUR[row["source"]], "marker": MARKER[row["target"]], "markersize": 4}
+            ax.plot([x, x], [row["best_value"], row["cf_value"]], color=COLOUR[row["source"]], linewidth=0.8)
+            ax.plot(x, row["best_value"], linestyle="none", markerfacecolor="white", **style)
+            ax.plot(x, row["cf_value"], linestyle="none", **style)
+    ax.axhline(float(np.nanmedian(rows["cf_value"].to_numpy(float))), color=SOFT, linewidth=1.4, zorder=0.6)
+    ax.axhline(0.5, color=SOFT, linewidth=0.8, linestyle=(0, (4, 2.5)), zorder=0.5)
+    names = [crossing.replace("Cross-", "cross-\n") for crossing in CROSSING]
+    ax.set_xticks(range(3), names)
+    ax.set_xlim(-0.6, 2.6)
+    ax.tick_params(axis="x", length=0)
+
+
+def dose_response(results: Results) -> Figure:
+    """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along directions
+    of the standard prompt under guided inference if they were run. Directions of the occlusion family are blue, those
+    of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are strong and
+    the others faint. Grey is the mean over the paths with its 95 % interval from resampled scenarios."""
+    rows = effects.paths(results.effects)
+    rows = rows.loc[rows["kind"] == "void"]
+    panels = _panels(rows)
+    if not panels:
+        return not_run_figure("Dose and response", why(results), PAGE_IN)
+    across = 2 if len(panels) > 1 else 1
+    lines = -(-len(panels) // across)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.75 + 1.75 * lines)
+        axes = figure.subplots(lines, 2 * across, sharey=True, squeeze=False)
+        pairs = axes.reshape(-1, 2)
+        for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
+            for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
+                _mean_band(ax, _of_panel(results.shares, part, path_set, side))
+                _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
+                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}", size=6.5)
+                ax.set_xlabel("α")
+        for ax in pairs[len(panels) :].flat:
+            ax.set_axis_off()
+        for line in axes:
+            line[0].set_ylabel("abstained, %")
+        axes[0, 0].set_ylim(-4, 104)
+        more = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
+        _legend(figure, *more, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
+    return figure
+
+
+def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
+    """The shares over a panel's paths along void directions, by alpha."""
+    of_side = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
+    return of_side.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
+
+
+def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
+    alphas, percent = shares["alpha"].to_numpy(float), 100 * shares[["low", "high", "abstention"]].astype(float)
+    ax.fill_between(alphas, percent["low"], percent["high"], color=GRID, alpha=0.7, linewidth=0, zorder=0.2)
+    ax.plot(alphas, percent["abstention"], color=SOFT, linewidth=2.2, zorder=0.3)
+
+
+def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
+    """Rows of each model and complete path set, under guided inference with directions of the standard prompt, or the
+    regimes next to them that the model has."""
+    found: dict[tuple[str, str], pd.DataFrame] = {}
+    for model, of in rows.groupby("model", sort=False):
+        guided = (of["directions"] == "standard").astype(int) + 2 * (of["regime"] == "guided").astype(int)
+        of = of.loc[guided == guided.max()]
+        for path_set, members in PATH_SETS.items():
+            part = of.loc[[pair in members for pair in zip(of["source"], of["target"], strict=True)]]
+            if set(zip(part["source"], part["target"], strict=True)) == set(members):
+                found[str(model), path_set] = part
+    return found
+
+
+def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str, str]]) -> None:
+    alphas = sorted(set(part["alpha"]))
+    for key, line in part.groupby(["source", "target"], sort=False):
+        source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
+        line = line.sort_values("alpha")
+        key = (source, target) in strong
+        ax.plot(
+            line["alpha"], 100 * line[side], color=FAMILY_COLOUR[taxonomy_of(source)], linestyle=LINE[source],
+            marker=MARKER[target], markersize=3.5, linewidth=1.2 if key else 0.7, alpha=1.0 if key else 0.45,
+            zorder=3 if key else 2, clip_on=False, label=path_name(source, target),
+        )  # fmt: skip
+    ax.set_xticks(alphas, [f"{alpha:g}" for alpha in alphas])
+
+
+def cosine_heatmaps(results: Results) -> Figure:
+    """Cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one scale of
+    ±0.6; the diagonal is 1 by definition, and a dash is a pair without a figure."""
+    rows = results.cosines
+    rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
+    if not len(rows):
+        return not_run_figure("Cosines of void directions", why(results), PAGE_IN)
+    panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
+    several = len({prompt for _, prompt, _ in panels}) > 1
+    columns = min(3, len(panels))
+    lines = -(-len(panels) // columns)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.2 + 1.95 * lines)
+        axes = figure.subplots(lines, columns, squeeze=False)
+        images = [_heatmap(ax, part) for ax, (_, _, part) in zip(axes.flat, panels, strict=False)]
+        for ax, (model, prompt, _) in zip(axes.flat, panels, strict=False):
+            ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if several else plain(model)[:26], size=7)
+        for ax in axes.flat[len(panels) :]:
+            ax.set_axis_off()
+        figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01)
+    return figure
+
+
+def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
+    wide = part.pivot_table(index="dataset", columns="other_dataset", values="cosine")
+    values = wide.reindex(index=list(DATASETS), columns=list(DATASETS)).to_numpy(float, copy=True)
+    np.fill_diagonal(values, np.nan)
+    image = ax.imshow(values, cmap="PuOr", vmin=-COSINE_SCALE, vmax=COSINE_SCALE)
+    ax.set_facecolor("#f2f4f7")
+    names = [SHORT[name] for name in DATASETS]
+    ax.set_xticks(range(4), names)
+    ax.set_yticks(range(4), names)
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    for (row, column), value in np.ndenumerate(values):
+        colour = SOFT if np.isnan(value) else "white" if abs(value) > 0.4 else "black"
+        text = "1" if row == column else "–" if np.isnan(value) else f"{value:.2f}".replace("-", "−")
+        ax.text(column, row, text, ha="center", va="center", size=6, color=colour)
+    return image

@@ -1,0 +1,320 @@
+"""The leaderboard of a study (docs/spec.md 5 and 10): one table for a terminal, a README, Dagster and a page.
+
+Model ids, epochs and versions are untrusted text: each medium escapes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
+from traps_pipeline.protocol.datasets import ARMS, DATASETS, SHORT
+from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.report.tables.table_columns import (
+    EPOCH,
+    MISSING,
+    MODEL,
+    PECS,
+    REGIME,
+    RUNS,
+    SHARES,
+    J,
+    N,
+    cell_trace,
+    interval,
+    meanings,
+)
+from traps_pipeline.report.terms import (
+    BROKEN_MARK,
+    BROKEN_TEXTS,
+    ENOUGH,
+    INCOMPLETE_MARK,
+    MISSING_MARK,
+    ROBUST_TERMS,
+    TITLES,
+)
+from traps_pipeline.report.writing import (
+    NONE,
+    NOT_RUN,
+    Behind,
+    Column,
+    PrintedTable,
+    fraction,
+    table_markdown,
+    table_text,
+)
+from traps_pipeline.scoring.analyses import of_several_runs
+from traps_pipeline.scoring.metrics import joined_epochs
+from traps_pipeline.scoring.score_rows import LEADERBOARD
+
+BOUNDS = "If missing: worst, best"
+# Columns that are shown only if their count, or that of another field, is not 0, because the table is wide already.
+OPTIONAL = {
+    Column("n_refused", "Refused", "count"): "n_refused",
+    Column("n_empty", "Empty", "count"): "n_empty",
+    Column("n_truncated", "Cut off", "count"): "n_truncated",
+    Column("n_unfinished", "Unfinished", "count"): "n_unfinished",
+    Column("n_degenerate", "Degenerate", "count"): "n_degenerate",
+    Column("n_unread", "Unread", "count"): "n_unread",
+    Column("broken", "Broken %", "percent"): "broken",
+    Column("n_not_json", "Not JSON", "count"): "n_not_json",
+    Column("bounds", BOUNDS, "range"): "n_missing",
+}
+Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
+ROBUST_COLUMNS = (Column("pecs_r", "PECS-R", "range", group=True), Column("gap", "gap", "range"))
+LEGEND = {
+    "Acc": "share of control items answered correctly",
+    "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
+    "FalseAbs": "share of control items, which can be answered, that the model abstains on",
+    "J": "AbsRec − FalseAbs, from −1 to 1; 0 for every strategy that does not distinguish void from control",
+    "PECS": "Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so chance alone "
+    "lifts a random strategy slightly above 0; look at the column J, which is not clipped",
+    "95 % CI": "interval of PECS, Bayesian bootstrap over scenarios with one unseen",
+    "±": "population standard deviation over runs",
+    "n": "pairs (one control, one void) per run",
+    "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
+    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall figure is incomplete if that of "
+    "any dataset is",
+    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall figure is broken if that of any dataset is",
+    "Refused": "items over all runs that the model or its provider refused; they are among the missing ones",
+    "Empty": "items over all runs answered with no text; they are among the missing ones",
+    "Cut off": "items over all runs whose text reached the limit of tokens before an answer; they are among the "
+    "missing ones",
+    "Unfinished": "items over all runs whose answer ended for an unknown reason (column finish_reason of the "
+    "answers); they are among the missing ones",
+    "Degenerate": "items over all runs answered with punctuation alone or with a text that repeats itself; they are "
+    "among the missing ones, and no judge takes them for abstentions",
+    "Unread": "items over all runs answered with a text in a form that the rule judges do not read; they are among the "
+    "missing ones: neither abstentions nor correct",
+    "Broken %": "share of items whose text is empty, cut off, unfinished, degenerate or unread",
+    "Not JSON": "items of the JSON regime, over all runs, whose text is not the object that the prompt asks for; they "
+    "are judged as they stand",
+    BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
+    "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
+    **ROBUST_TERMS,
+    "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
+    "Overall": "equal-weight mean over the four datasets",
+}
+
+
+def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
+    """LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first; one table for each
+    panel. said: further notes."""
+    return "\n".join(table_text(table) for table in ranked_tables(board, robust, said))
+
+
+def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
+    """LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first. said: further
+    notes."""
+    terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
+    return "\n".join([*(table_markdown(table) for table in ranked_tables(board, robust, said)), *terms]) + "\n"
+
+
+def ranked_tables(
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
+) -> list[PrintedTable]:
+    """The brief table that ranks the entries of each panel. said: further notes of the first."""
+    return _with_notes([_of_one_panel(part, robust, True, suffix)[0] for suffix, part in _by_panel(board)], said)
+
+
+def _with_notes(tables: list[PrintedTable], said: Sequence[str]) -> list[PrintedTable]:
+    first = replace(tables[0], notes=[*tables[0].notes, *said])
+    return [first, *tables[1:]]
+
+
+def leaderboards(
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
+) -> list[PrintedTable]:
+    """Tables of LEADERBOARD rows for each panel, whose entries are never ranked together: first the one that ranks the
+    entries, then one for each other dataset. The overall table has the figures of ROBUST rows, if there are any.
+
+    The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
+    without a row in it comes last. said: further notes of the first table.
+    """
+    tables = [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, False, suffix)]
+    return _with_notes(tables, said)
+
+
+def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """The rows by panel, with what tells the names of their tables apart; entries of several panels come last."""
+    if board.empty:
+        return [("", board)]
+    of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
+    panels = sorted(set(of_entry), key=lambda names: (names.count("+"), names))
+    return [(f"_{number}" if number else "", board.loc[of_entry == name]) for number, name in enumerate(panels)]
+
+
+def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
+    datasets = set(board["dataset"])
+    ranked = next((name for name in TITLES if name in datasets), "overall")
+    others = [name for name in DATASETS if name in datasets and name != ranked]
+    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in others]
+    rows = []
+    if robust is not None and ranked == "overall":  # a null text that was read from a file is NaN
+        rows = robust.astype(object).where(robust.notna(), None).to_dict("records")
+    beside = {(row["model"], row["regime"]): row for row in rows}
+    entries = {*zip(board["model"], board["regime"], strict=True)}
+    beside = {key: row for key, row in beside.items() if key in entries}
+    return [_leaderboard(board, ranked, others, beside, brief, suffix), *own]
+
+
+def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
+    """The entries of LEGEND for the columns and marks that the board has."""
+    needed = {column.heading: field for column, field in OPTIONAL.items()}
+    needed |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
+    absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
+    absent |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
+    return {term: meaning for term, meaning in LEGEND.items() if term not in absent}
+
+
+def provenance(board: pd.DataFrame) -> str:
+    """A sentence that names the panels, benchmark versions and epochs of the board's figures."""
+    versions = _distinct(board["benchmark_version"].unique(), " + ")
+    epochs = _distinct(board["epoch"].unique(), "+")
+    return (
+        f"{judged_by(board)} Benchmark version{'s' * (len(versions) > 1)} {', '.join(versions) or NONE}; "
+        f"epoch{'s' * (len(epochs) > 1)} {', '.join(epochs) or NONE}."
+    )
+
+
+def judged_by(board: pd.DataFrame) -> str:
+    """A sentence that names the panels that judged, and says where their figures are not comparable."""
+    panels = _distinct(board["panel"].unique(), "+")
+    names = [_panel_in_words(panel) for panel in panels]
+    several = len(panels) > 1
+    said = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
+    said += "; figures of different panels are not ranked or compared" * several
+    rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
+    others = sorted({model for panel, model in rows if by_rules(panel, model)})
+    shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
+    return f"{said}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {shown}." if others else "")
+
+
+def _panel_in_words(panel: str) -> str:
+    name, _, version = panel.partition("@")
+    alone = ", one judge, so that nothing is known of agreement" if version.endswith(ONE_JUDGE) else ""
+    return f"{name} (version {version.removesuffix(ONE_JUDGE)}{alone})"
+
+
+def _distinct(values: Iterable[Any], separator: str) -> list[str]:
+    return sorted({part for value in values for part in str(value).split(separator) if part})
+
+
+def _leaderboard(
+    board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool, suffix: str
+) -> PrintedTable:
+    rows = _entries(board, dataset, others)
+    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, J]
+    for name in others:
+        heading = f"PECS {SHORT[name] if brief else TITLES[name]}"
+        columns.append(Column(name, heading, "fraction", mark=f"{name}_mark", group=name == others[0]))
+    if beside:
+        rows, columns = _with_robust(rows, beside), [*columns, *ROBUST_COLUMNS]
+    columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
+    columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
+    columns += [
+        column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
+    ]
+    marks = [*rows["n_mark"], *rows["missing_mark"], *rows["model_mark"]]
+    notes = [*meanings(marks), *_notes_on_arms(beside)]
+    if brief:
+        columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
+    else:
+        mixed = board["panel"].str.contains("+", regex=False).any()
+        notes = ["not ranked: each entry is of several panels" if mixed else "ranked by PECS", *notes]
+    return PrintedTable(
+        f"leaderboard_{dataset}{suffix}", TITLES[dataset], rows, columns, notes, "this study has no leaderboard yet",
+        _trace,
+        dash="not all four datasets evaluated, or nothing decided" if dataset == "overall" else "nothing decided",
+        lead=provenance(board),
+    )  # fmt: skip
+
+
+def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
+    """The rows with PECS-R and gap as printed; PECS-R has the number of its arms unless these are all."""
+    found = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
+    return rows.assign(
+        pecs_r=[fraction(row["pecs_r"]) + _of_arms(row) if row else NOT_RUN for row in found],
+        gap=[fraction(row["gap"]) if row else NOT_RUN for row in found],
+    )
+
+
+def _of_arms(row: Mapping[str, Any]) -> str:
+    return f" ({len(row['arms'])} of {len(ARMS)} arms)" if len(row["arms"]) < len(ARMS) else ""
+
+
+def _notes_on_arms(beside: Robust) -> list[str]:
+    """Notes that name the arms of each PECS-R, and the reasons why there is no gap."""
+    entries: dict[tuple[str, ...], list[str]] = {}
+    for (model, regime), row in beside.items():
+        entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
+    notes = [
+        f"PECS-R{' of ' + ', '.join(names) if len(entries) > 1 else ''} is over {len(arms)} of {len(ARMS)} arms: "
+        + ", ".join(arms)
+        for arms, names in entries.items()
+    ]
+    refused = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
+    return [*notes, *(f"no gap: {why}" for why in refused)]
+
+
+def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
+    if row.get(field) == NOT_RUN:
+        return None
+    return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)
+
+
+def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
+    """One row per (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, and marks. For
+    an entry without a row of the dataset the counts are sums over all its rows."""
+    found, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
+    for row in of_several_runs(board).to_dict("records"):
+        entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
+    for by_dataset in entries.values():
+        main = by_dataset.get(dataset)
+        counted = list(by_dataset.values()) if main is None else [main]
+        entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
+        summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
+        entry |= {n: sum(row[n] for row in counted) for n in (*summed, "n_unread", "n_not_json")}
+        entry["mark"] = _mark(main) if main else ""
+        entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted) else ""
+        entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted) else ""
+        entry["missing_mark"] = MISSING_MARK if entry["n_missing"] else ""
+        entry["ci"] = (main and interval(main)) or NONE
+        entry["bounds"] = _bounds(main) if main and main["n_missing"] else ""
+        for name in others:
+            row = by_dataset.get(name)
+            entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
+        found.append(entry)
+    own = [column.name for column in LEADERBOARD.columns]
+    marks = [
+        "mark",
+        "n_mark",
+        "model_mark",
+        "missing_mark",
+        "ci",
+        "bounds",
+        *others,
+        *(f"{name}_mark" for name in others),
+    ]
+    return pd.DataFrame(sorted(found, key=_rank), columns=pd.Index([*own, *marks]))
+
+
+def _mark(row: Mapping[str, Any]) -> str:
+    """The marks of a PECS: that too little is answered, that what is answered is broken."""
+    return (INCOMPLETE_MARK if row["incomplete"] else "") + (BROKEN_MARK if row["is_broken"] else "")
+
+
+def _bounds(row: Mapping[str, Any]) -> str:
+    return f"[{fraction(row['pecs_low'])}, {fraction(row['pecs_high'])}]"
+
+
+def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
+    """Sort key: best PECS first, nulls last; ties by model, then in the order of the regimes."""
+    pecs = float(entry.get("pecs", float("nan")))
+    null = pecs != pecs
+    regimes = (*REGIMES, entry["regime"])
+    return null, 0.0 if null else -pecs, entry["model"], regimes.index(entry["regime"])

@@ -1,0 +1,203 @@
+"""The frames from which tables and figures are made, for a study or for the paper: tidy, with the same columns.
+
+A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
+`epoch`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from traps_pipeline.judging.human_label_rows import HUMAN_AGREEMENT
+from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
+from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.control_rows import (
+    GATE,
+    PATCHING,
+    PROBE_BASELINES,
+    RISK_COVERAGE,
+    STEERING_NULLS,
+    STEERING_PECS,
+)
+from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT
+from traps_pipeline.scoring.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
+from traps_pipeline.scoring.score_rows import (
+    CONFABULATION_PREVALENCE,
+    CONTRASTS,
+    HYPOTHESES,
+    LEADERBOARD,
+    LEAVE_ONE_OUT,
+    REGIME_TESTS,
+    ROBUST,
+)
+from traps_pipeline.storage.study import MechanismSettings
+from traps_pipeline.storage.tables import Table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from traps_pipeline.report.writing import PrintedTable
+
+CELL_COLUMNS = (
+    *("model", "dataset", "regime", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
+    *("acc", "acc_std", "abs_rec", "abs_rec_std", "false_abs", "false_abs_std", "pecs", "pecs_std"),
+)
+RATE_COLUMNS = (
+    *("model", "taxonomy", "visual", "textual", "gap", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
+)
+SUB_COLUMNS = (
+    *("dataset", "sub_scenario", "n_pairs", "n_missing", "n_models", "guided_n_models", "uplift_n_models"),
+    *("ill_posed_n_models", "acc", "false_abs", "abs_rec", "pecs", "guided_abs_rec"),
+    *("guided_false_abs", "guided_pecs", "abs_rec_uplift", "false_abs_uplift", "abs_rec_ill_posed"),
+    *("textual_over_visual", "answer_type", "epoch"),
+)
+
+
+Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the results, by the name of the frame they make
+
+
+class Made:
+    """A frame of `Results`, made when it is first read: by the results' own maker of that name if there is one, else by
+    `derive` from the other frames, else it has the rows of `table`."""
+
+    def __init__(
+        self, doc: str = "", *, table: Table | None = None, derive: Callable[[Results], pd.DataFrame] | None = None
+    ) -> None:
+        self.__doc__, self.table, self.derive = doc or (f"{table.name.upper()} rows." if table else ""), table, derive
+
+    def __set_name__(self, owner: type[Results], name: str) -> None:
+        self.name = name
+
+    def __get__(self, results: Results, owner: type[Results]) -> pd.DataFrame:
+        if self.name not in results.made:
+            results.made[self.name] = self._make(results)
+        return results.made[self.name]
+
+    def _make(self, results: Results) -> pd.DataFrame:
+        make = results.makers.get(self.name, self.derive)
+        if make is not None:
+            return make(results)
+        if self.table is None:
+            raise NotImplementedError(f"{type(results).__name__} has no maker of {self.name!r}")
+        return results.rows(self.table)
+
+
+class Results:
+    """One set of results; a frame has no rows if its part was not run.
+
+    To add a frame, add an attribute here, and a function of that name to the `makers` of a study's and of the paper's
+    results.
+    """
+
+    source = ""  # in words, for titles
+    is_study = False
+    judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
+    makers: ClassVar[Makers] = {}
+    mechanism: MechanismSettings | None = None  # of a study that looks inside models
+
+    board = Made(table=LEADERBOARD)
+    cells = Made("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
+    overall = Made(
+        "One row per (model, regime) that has all four datasets: the columns of cells without dataset, and j; a study's"
+        " rows also have j_std, the intervals and ranks of LEADERBOARD. epoch joins the datasets' epochs by +."
+    )
+    rates = Made("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
+    sub_scenarios = Made("SUB_COLUMNS: means over models, one row per sub-scenario.")
+    sub_cells = Made("One row per (model, dataset, regime) and sub-scenario (column scope).")
+    labels = Made("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
+    agreement = Made(table=AGREEMENT)
+    bias = Made(table=JUDGE_BIAS)
+    leave_one_out = Made(table=LEAVE_ONE_OUT)
+    robust = Made(table=ROBUST)
+    hypotheses = Made(table=HYPOTHESES)
+    contrasts = Made(table=CONTRASTS)
+    regime_tests = Made(table=REGIME_TESTS)
+    confabulation = Made(table=CONFABULATION_PREVALENCE)
+    validation = Made(table=JUDGE_VALIDATION)
+    human_row = Made(table=HUMAN_ROW)
+    human_agreement = Made(table=HUMAN_AGREEMENT)
+    panel_errors = Made(table=PANEL_ERRORS)
+    corrected = Made(table=CORRECTED)
+    composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
+    prompted_probes = Made("PROBES rows under every prompt.", table=PROBES)
+    prompted_baselines = Made("PROBE_BASELINES rows under every prompt.", table=PROBE_BASELINES)
+    probes = Made(
+        "PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.",
+        derive=lambda results: _of_probe_prompt(results.prompted_probes),
+    )
+    cosines = Made("COSINES rows at the steered layer of each model.")
+    effects = Made("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
+    baselines = Made(
+        "PROBE_BASELINES rows under PROBE_PROMPT.", derive=lambda results: _of_probe_prompt(results.prompted_baselines)
+    )
+    gate = Made(table=GATE)
+    risk_coverage = Made(table=RISK_COVERAGE)
+    patching = Made(table=PATCHING)
+    own_effects = Made(
+        "STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.",
+        derive=lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)),
+    )
+    nulls = Made(table=STEERING_NULLS)
+    steering_pecs = Made(table=STEERING_PECS)
+    shares = Made(table=STEERING_SHARES)
+    steering_regimes = Made(
+        "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
+    )
+    steering_families = Made(
+        "Rows of `mechanism.effects.family_asymmetry`.",
+        derive=lambda results: effects.family_asymmetry(results.effects),
+    )
+    steering_domains = Made(
+        "Rows of `mechanism.effects.domains`.", derive=lambda results: effects.domains(results.effects)
+    )
+    steering_layers = Made("Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects))
+
+    def __init__(self) -> None:
+        self.made: dict[str, pd.DataFrame] = {}
+        self.kept: dict[str, list[PrintedTable]] = {}  # the tables of the catalogue that were made of them, by name
+        # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
+        self.refused: dict[str, list[str]] = {}
+
+    def rows(self, table: Table) -> pd.DataFrame:
+        """All rows of a table of a study; for the paper, a frame without rows."""
+        import pandas as pd
+
+        return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
+
+    def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
+        """Why two entries (model, regime) may not be compared on a dataset or `overall`, from the contrasts, which
+        check every item; None if they may be compared."""
+        return self._refusals.get((dataset, frozenset((left, right))))
+
+    @cached_property
+    def _refusals(self) -> dict[tuple[str, frozenset[tuple[str, str]]], str]:
+        rows = self.contrasts.dropna(subset=["refused"]).to_dict("records")
+        sides = [frozenset((r[f"{side}_model"], r[f"{side}_regime"]) for side in ("left", "right")) for r in rows]
+        return {(row["dataset"], pair): row["refused"] for row, pair in zip(rows, sides, strict=True)}
+
+    def why(self, what: str) -> str:
+        """The reason, for people, why a frame has no rows."""
+        return "; ".join(self.refused.get(what, [])) or (
+            "this study has no such results yet" if self.is_study else "the paper prints no such table"
+        )
+
+
+def _of_probe_prompt(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.loc[rows["prompt"] == PROBE_PROMPT]
+
+
+def datasets_of(cells: pd.DataFrame) -> list[str]:
+    """The datasets of the cells, in the benchmark's order."""
+    names = set(cells["dataset"])
+    return [name for name in DATASETS if name in names]
+
+
+def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """The parts below each other; without parts, a frame without rows or columns."""
+    import pandas as pd
+
+    return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

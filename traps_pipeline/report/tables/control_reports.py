@@ -1,0 +1,373 @@
+"""Controls beside the mechanistic claims: probes beside baselines, directions among their nulls, what steering and the
+gate do to PECS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from traps_pipeline.mechanism.mechanism_rows import CLAMP, PROJECT_OUT
+from traps_pipeline.mechanism.transfer_paths import path_name, probed_taxonomy
+from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.probe_baselines import SHORTCUTS, against
+from traps_pipeline.report.tables.steering_tables import DIRECTIONS, FEW, INFERENCE, few, why
+from traps_pipeline.report.tables.table_columns import MODEL
+from traps_pipeline.report.writing import Column, PrintedTable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEW_NOTE = f"† fewer than {FEW} controls or voids: the value says little"
+DRAWS = "± standard deviation over draws of noise"
+LAYER = Column("layer", "Layer", "count")
+DOSE = Column("step", "Dose")
+SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
+
+
+# --- probes and their baselines ---------------------------------------------------------------------------------------
+
+WHAT = {
+    "occlusion_answerable": "void clip, answerable question",
+    "decoy": "decoy: a panel that hides nothing",
+    "length_matched": "whole clip as short as a void",
+    "chaotic_time_swapped": "frame times of the other side",
+}
+
+
+def probe_baselines(results: Results) -> list[PrintedTable]:
+    """The probe on states beside probes on raw inputs, on the output margin and on noise: on every pair of datasets,
+    and on clips that only look like voids."""
+    return [_beside(results), _look_alikes(results)]
+
+
+def beside(results: Results) -> pd.DataFrame:
+    """One row per model and ordered pair of datasets, a dataset on itself among them: the probe at the source's own
+    layer, with its interval, and each baseline. Within a taxonomy all of them are fitted without the scored scenario
+    (`held_out`), elsewhere on all of the source (`transfer`)."""
+    import pandas as pd
+
+    wanted = pd.DataFrame(
+        [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
+        columns=pd.Index(["source", "target", "analysis"]),
+    )
+    probe = results.probes.loc[results.probes["source_best"].eq(True)]
+    return _with_baselines(results, probe.merge(wanted, on=["source", "target", "analysis"]))
+
+
+def look_alikes(results: Results) -> pd.DataFrame:
+    """As `beside`, on the items that only look like voids, by probes of the datasets of their taxonomy."""
+    probe = results.probes.loc[results.probes["source_best"].eq(True) & results.probes["target"].isin([*WHAT])]
+    own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
+    return _with_baselines(results, probe.loc[own])
+
+
+def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
+    import pandas as pd
+
+    keys = ["model", "prompt", "analysis", "source", "target"]
+    rows = results.baselines
+    probe = (probe if len(rows) else probe.head(0)).astype({"prompt": object})
+    wide = rows.pivot_table(index=keys, columns="features", values="value", observed=True)
+    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise", *other_probes(results)])).reset_index()
+    noise = rows.loc[rows["features"] == "noise", [*keys, "spread"]].rename(columns={"spread": "noise_spread"})
+    kept = probe[[*keys, "layer", "value", "low", "high", "n_voids", "n_controls"]]
+    table = kept.merge(wide, on=keys, how="left").merge(noise, on=keys, how="left")
+    return table.assign(mark=few(table, "n_voids", "n_controls"))
+
+
+def other_probes(results: Results) -> list[str]:
+    """The further probes of the states that experiments name, as features of `probe_baselines`."""
+    return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
+
+
+_PROBE = (
+    Column("layer", "Layer", "count"), Column("value", "States", "fraction", mark="mark"),
+    Column("low", "from", "fraction"), Column("high", "to", "fraction"),
+)  # fmt: skip
+_BASELINES = (
+    *(Column(name, name.capitalize(), "fraction") for name in SHORTCUTS),
+    Column("output margin", "Output margin", "fraction"),
+    Column("noise", "Noise", "fraction", spread="noise_spread"),
+)
+_SIDES = (Column("n_voids", "Voids", "count"), Column("n_controls", "Controls", "count"))
+_NOTES = (
+    "AUROC of the same protocol on other features than states; the layer is the source’s own, which uses no label of "
+    "a target",
+    "output margin: log-odds that the first answer token begins an abstention; noise: random vectors as wide as "
+    "states, mean ± deviation over draws, the floor of the split",
+    "a probe shows understanding only as far as it is above the raw inputs, and a gap between states and output only "
+    "as far as it is above the output margin",
+)
+
+
+def _beside(results: Results) -> PrintedTable:
+    rows = beside(results)
+    rows = rows.assign(path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)])
+    others = [Column(name, name.capitalize(), "fraction") for name in other_probes(results)]
+    columns = [MODEL, Column("path", "Path"), *_PROBE, *others, *_BASELINES, *_SIDES]
+    notes = [
+        *_NOTES,
+        "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper has no such baselines"
+    title = "Probes beside their baselines"
+    return PrintedTable("probe_baselines", title, rows, columns, notes, absent, deviation=DRAWS)
+
+
+def _look_alikes(results: Results) -> PrintedTable:
+    rows = look_alikes(results)
+    named = rows.assign(
+        what=[WHAT[name] for name in rows["target"]],
+        against=[AGAINST[name] for name in rows["analysis"]],
+        path=[SHORT.get(name, name) for name in rows["source"]],
+    )
+    columns = [
+        MODEL, Column("what", "Items"), Column("against", "Told apart from"), Column("path", "Source"), *_PROBE,
+        *_BASELINES, *_SIDES,
+    ]  # fmt: skip
+    notes = [
+        *_NOTES[:2],
+        "told apart from voids: 1 for a probe that detects what cannot be known, 0.5 for one that detects what both "
+        "have; from controls: the reverse",
+        "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper has no such items"
+    title = "What only looks like a void"
+    return PrintedTable("probe_look_alikes", title, named, columns, notes, absent, deviation=DRAWS)
+
+
+AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
+
+
+# --- steering ---------------------------------------------------------------------------------------------------------
+
+
+def steering_nulls(results: Results) -> list[PrintedTable]:
+    """The effect of void directions on their own datasets among nulls of the same length, and PECS of the steered
+    model under each sign policy."""
+    return [_nulls(results), _pecs(results)]
+
+
+def _dose(rows: pd.DataFrame) -> list[str]:
+    words = {"alpha": "α {:g}", "gap": "{:g} gap", PROJECT_OUT: "{:.0%} taken out", CLAMP: "set to {:g} gap"}
+    return [words[unit].format(dose) if dose else "none" for unit, dose in zip(rows["unit"], rows["dose"], strict=True)]
+
+
+def _nulls(results: Results) -> PrintedTable:
+    rows = results.nulls
+    named = rows.assign(
+        step=_dose(rows), dataset=[SHORT.get(name, name) for name in rows["target"]], mark=few(rows, "n")
+    )
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("dataset", "Dataset"), LAYER, DOSE, Column("side", "Side"),
+        Column("null", "Null"), Column("effect", "Effect, points", "percent", mark="mark"),
+        Column("null_mean", "Null, mean", "percent"), Column("null_lowest", "lowest", "percent"),
+        Column("null_highest", "highest", "percent"), Column("draws", "Draws", "count"),
+        Column("n_at_least", "Draws at least as large", "count"), Column("p", "p", "p", 3), Column("n", "n", "count"),
+    ]  # fmt: skip
+    notes = [
+        "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
+        "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
+        "(1 + draws), one-sided, not corrected for the number of rows",
+        *_ahead(rows),
+        *([FEW_NOTE] if "†" in set(named["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper has no such nulls"
+    return PrintedTable("steering_nulls", "Void directions among their nulls", named, columns, notes, absent)
+
+
+def _ahead(rows: pd.DataFrame) -> list[str]:
+    """Where the void direction is ahead of all but a twentieth of its nulls, in words."""
+    own = rows.loc[rows["target"] != "all"]
+    if own.empty:
+        return []
+    count = int((20 * own["n_at_least"] <= own["draws"]).sum())
+    where = f"in {count} of {len(own)} rows" if count else "nowhere"
+    return [f"the void direction is ahead of 19 of 20 draws {where}; one row in ten would be so by chance"]
+
+
+MODEL_OF = ("model", "directions", "regime")
+
+
+def _pecs(results: Results) -> PrintedTable:
+    import pandas as pd
+
+    rows = results.steering_pecs
+    rows = rows.loc[rows["source"] == rows["target"]]
+    unsteered = rows["dose"] == 0  # once for each path: it is the same model in every unit and under all signs
+    named = pd.concat([rows.loc[unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~unsteered]])
+    rows = named.sort_values([*MODEL_OF, "source"], kind="stable", ignore_index=True)
+    named = rows.assign(
+        step=_dose(rows),
+        policy=[SIGNS[name] if dose else "not steered" for name, dose in zip(rows["signs"], rows["dose"], strict=True)],
+        path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)],
+        mark=few(rows, "n_controls", "n_voids"),
+    )
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("path", "Path"), LAYER, Column("policy", "Signs"), DOSE,
+        Column("acc", "Acc %", "percent"), Column("false_abs", "FalseAbs %", "percent"),
+        Column("abs_rec", "AbsRec %", "percent"), Column("j", "J", "fraction"),
+        Column("pecs", "PECS", "fraction", mark="mark"), Column("degenerate", "Degenerate %", "percent"),
+        Column("n_controls", "Controls", "count"), Column("n_voids", "Voids", "count"),
+    ]  # fmt: skip
+    notes = [
+        "each dataset along its own direction; + on controls and − on voids needs the side of each item, which nobody "
+        "has who uses a model",
+        "degenerate: cut off, a phrase four times in a row, or another script or language than the unsteered answer",
+        *([FEW_NOTE] if "†" in set(named["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper prints no correctness of steered answers"
+    return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
+
+
+# --- the gate ---------------------------------------------------------------------------------------------------------
+
+DEFAULT_GATE = {"source": "other datasets", "threshold": "mid"}
+SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
+
+
+def gate(results: Results) -> list[PrintedTable]:
+    """Probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on other
+    features; what it does to items that must be answered; and what the guided prompt does to answers and to states."""
+    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
+
+
+_GATED = (
+    Column("plain_pecs", "PECS, plain", "fraction"), Column("pecs", "PECS, gated", "fraction", mark="mark"),
+    Column("pecs_low", "from", "fraction"), Column("pecs_high", "to", "fraction"),
+    Column("acc", "Acc %", "percent"), Column("abs_rec", "AbsRec %", "percent"),
+    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"), *_SIDES,
+)  # fmt: skip
+_GATE_NOTES = (
+    "a gated answer becomes an abstention and every other answer keeps its verdict; no gate has seen the scenario that "
+    "it decides about",
+    "expected: share of the sources’ own unseen controls above the threshold; the difference from FalseAbs of answers "
+    "that do not abstain by themselves is the shift of calibration",
+)
+
+
+def _gates(results: Results) -> pd.DataFrame:
+    """The rows of gates: those on states first, from the other datasets, at the mid threshold, over all datasets."""
+    rows = results.gate
+    firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
+    later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
+    rows = rows.assign(**later).sort_values(["model", "regime", *later], kind="stable", ignore_index=True)
+    return rows.assign(
+        mark=few(rows, "n_controls", "n_voids"),
+        layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
+        dataset=[SHORT.get(name, name) for name in rows["target"]],
+        sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
+    ).drop(columns=[*later])
+
+
+def _gate_sources(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    rows = rows.loc[(rows["features"] == "states") & rows["target"].isin([*SHORT, "all"])]
+    columns = [
+        MODEL, Column("regime", "Answers"), Column("sources", "Gate from"), Column("threshold", "Threshold"),
+        Column("dataset", "Target"), LAYER, *_GATED,
+    ]  # fmt: skip
+    notes = [
+        *_GATE_NOTES,
+        "mid: half-way between the means of the sides; J: the cut with the largest J on unseen source items; "
+        "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, absent)
+
+
+def _gate_controls(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    for name, value in (DEFAULT_GATE | {"target": "all"}).items():
+        rows = rows.loc[rows[name] == value]
+    columns = [MODEL, Column("regime", "Answers"), Column("features", "Features"), *_GATED]
+    notes = [
+        "gates from other datasets at the mid threshold, mean over the four datasets",
+        "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
+        "and on an untrained model’s states",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
+
+
+def _gate_answerable(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
+    rows = rows.loc[rows["target"].isin([*WHAT]) & (rows["target"] != "chaotic_time_swapped")]
+    rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
+    rows = rows.assign(what=[WHAT[name] for name in rows["target"]], mark=few(rows, "n_controls"))
+    columns = [
+        MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
+        Column("false_abs", "Abstained on %", "percent", mark="mark"),
+        Column("expected_false_abs", "expected %", "percent"), Column("n_controls", "n", "count"),
+    ]  # fmt: skip
+    notes = [
+        "all of these items can be answered, so that every abstention of a gate is a false one",
+        *([FEW_NOTE.replace("controls or voids", "items")] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
+
+
+def prompts(results: Results) -> pd.DataFrame:
+    """One row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
+    prompts the AUROC of the probe (at the dataset's own layer, fitted without the scored scenario) and of the output
+    margin; those of the best raw input and of noise; n_answered, the fewest voids that were answered under either
+    prompt, n_voids and n_controls of the probe."""
+    import pandas as pd
+
+    keys = ["model", "dataset"]
+    plain = results.gate.loc[results.gate["target"].isin(DATASETS)].rename(columns={"target": "dataset"})
+    plain = plain.astype({"regime": object, "dataset": object})
+    table = plain.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
+    table = table.reindex(columns=pd.Index(PROMPTING)).add_prefix("said_")
+    table["change"] = table["said_guided"] - table["said_standard"]
+    counted = {"n_answered": (plain, "n_voids")}
+    own = [results.prompted_probes.loc[results.prompted_probes["source_best"].eq(True)]]
+    own += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
+    for name, rows in zip(("probe", "margin"), own, strict=True):
+        rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
+        rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
+        wide = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
+        table = table.join(wide.reindex(columns=pd.Index(PROMPTING)).add_prefix(f"{name}_"))
+        if name == "probe":
+            counted |= {count: (rows, count) for count in ("n_voids", "n_controls")}
+    for name, (rows, count) in counted.items():
+        table[name] = rows.groupby(keys)[count].min().reindex(table.index)
+    floor = against(results, "held_out")
+    floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
+    return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
+
+
+def _prompts(results: Results) -> PrintedTable:
+    rows = prompts(results)
+    rows = rows.assign(
+        name=[SHORT.get(name, name) for name in rows["dataset"]],
+        said_mark=few(rows, "n_answered"),
+        probe_mark=few(rows, "n_voids", "n_controls"),
+    )
+    columns = [
+        MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent", mark="said_mark"),
+        Column("said_guided", "guided", "percent", mark="said_mark"),
+        Column("change", "guided − standard", "percent", mark="said_mark"),
+        *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction", mark="probe_mark")
+          for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTING),
+        Column("raw", "Best raw input"), Column("raw_value", "its AUROC", "fraction"),
+        Column("noise", "Noise", "fraction", spread="noise_spread"),
+        Column("n_answered", "Voids answered about", "count"), *_SIDES,
+    ]  # fmt: skip
+    notes = [
+        "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
+        "states under the VQA prompt of that name, fitted without the scored scenario); the best raw input and noise "
+        "are the same under both prompts",
+        _NOTES[1],
+        *([FEW_NOTE] if "†" in {*rows["said_mark"], *rows["probe_mark"]} else []),
+    ]
+    absent = why(results) if results.is_study else "the paper prints no such figures"
+    title = "What the prompt changes, in answers and in states"
+    return PrintedTable("prompt_gate", title, rows, columns, notes, absent, deviation=DRAWS)

@@ -1,0 +1,123 @@
+"""What people score, how far they agree, and scores corrected for the panel's errors (docs/people.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.protocol.metrics import METRIC_WORDS, SHARES
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import DATASET, MODEL, REGIME, RUNS, ordered, titled
+from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, fraction, percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+BY_PEOPLE = "nobody has labelled yet (run traps annotate)"
+_FIGURES = {name: metric.heading for name, metric in METRIC_WORDS.items()}
+_PERCENT = (*SHARES, "sensitivity", "specificity")
+
+
+def people(results: Results) -> list[PrintedTable]:
+    """What people score on the clips, by dataset, and how far people agree about clips and answers."""
+    rows = ordered(titled(results.human_row), ["dataset"])
+    rows = _with_intervals(rows, [*_FIGURES])
+    figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
+    columns = [
+        DATASET, *figures, Column("agreement", "Agree %", "percent"),
+        Column("alpha", "Krippendorff’s α", "fraction", 2),
+        Column("seconds", "Seconds", "ratio"), Column("n_people", "People", "count"),
+        Column("n_clips", "Clips", "count"), Column("n_labels", "Labels", "count"),
+    ]  # fmt: skip
+    notes = [
+        "labels of all people pooled; brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen",
+        "agree, α: on whether the clip lets the question be answered",
+    ]
+    agreement = ordered(results.human_agreement, ["task", "decision"])
+    of_tasks = [
+        Column("task", "Task"), Column("decision", "Decision"), Column("agreement", "Agree %", "percent"),
+        Column("alpha", "Krippendorff’s α", "fraction", 2), Column("n_shared", "Labelled twice", "count"),
+        Column("n_units", "Labelled", "count"), Column("seconds", "Seconds", "ratio"),
+    ]  # fmt: skip
+    undefined = sorted(set(agreement["undefined"].dropna()))
+    return [
+        PrintedTable("people", "People", rows, columns, notes if len(rows) else [], BY_PEOPLE),
+        PrintedTable(
+            "people_agreement", "Agreement of people", agreement, of_tasks, [], BY_PEOPLE,
+            dash="; ".join(undefined) or "undefined",
+        ),
+    ]  # fmt: skip
+
+
+def judge_corrected(results: Results) -> list[PrintedTable]:
+    """The panel against people, and the leaderboard as judged and corrected for the panel's errors."""
+    errors = _with_intervals(results.panel_errors, ["sensitivity", "specificity"])
+    of_panel = [
+        Column("task", "Task"), Column("sensitivity_shown", "Sensitivity %", "range"),
+        Column("specificity_shown", "Specificity %", "range"), Column("n_answers", "Answers", "count"),
+        Column("n_yes", "People’s yes", "count"), Column("n_tied", "Tied", "count"),
+        Column("n_people", "People", "count"),
+    ]  # fmt: skip
+    rows = results.corrected
+    overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
+    shown = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
+    shown = ordered(titled(shown), ["dataset", "model", "regime"])
+    figures = [
+        Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
+        for field, heading in _FIGURES.items()
+        for end in ("", "_corrected")
+        if field != "j"
+    ]
+    notes = [
+        "judged and corrected in the same resamples of scenarios; a correction assumes that the panel errs alike on "
+        "the answers of all models"
+    ]
+    why = "not validated: people labelled no answers (run traps annotate)"
+    reasons = sorted(set(results.panel_errors["undefined"].dropna()))
+    return [
+        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, why),
+        PrintedTable(
+            "judge_corrected", "Judged, and corrected for the panel’s errors", shown,
+            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(shown) else [], why,
+        ),
+    ]  # fmt: skip
+
+
+def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
+    """The rows with `FIELD_shown`: the figure and its interval as printed."""
+    shown = {f"{field}_shown": [_shown(row, field) for row in rows.to_dict("records")] for field in fields}
+    return rows.assign(**shown)
+
+
+def _shown(row: Mapping[Any, Any], field: str) -> str:
+    figure = percent if field.removesuffix("_corrected") in _PERCENT else fraction
+    own, low, high = (figure(row[name]) for name in (field, f"{field}_ci_low", f"{field}_ci_high"))
+    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
+
+
+def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
+    """Notes beside a leaderboard, from HUMAN_ROW and PANEL_ERRORS rows: what people score, and whether the panel was
+    validated."""
+    return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
+
+
+def _score_of_people(rows: pd.DataFrame) -> str:
+    if rows.empty:
+        return f"{NOT_RUN}, {BY_PEOPLE}"
+    by_dataset = {row["dataset"]: row for row in rows.to_dict("records")}
+    row = by_dataset.get("overall", {})
+    if not row or row["pecs"] != row["pecs"]:
+        return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
+    figures = ", ".join(f"{heading.removesuffix(' %')} {_shown(row, field)}" for field, heading in _FIGURES.items())
+    return f"{figures} ({row['n_people']} people, {row['n_clips']} clips, {row['seconds']:.0f} s a clip)"
+
+
+def _validated(rows: pd.DataFrame) -> str:
+    if rows.empty:
+        return "not validated, people have labelled none of its answers (run traps annotate)"
+    told = [
+        f"{row['task']} sensitivity {_shown(row, 'sensitivity')} %, specificity {_shown(row, 'specificity')} %"
+        for row in rows.to_dict("records")
+    ]
+    lacking = " (the other task is not validated)" if len(told) == 1 else ""
+    return f"against people {'; '.join(told)}{lacking}"

@@ -1,0 +1,80 @@
+"""What the paper supposes and did not measure, dose by dose (docs/hypotheses.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, ordered
+from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from traps_pipeline.scoring.doses import Hypothesis
+
+WHY = "no variation was run (traps run hypotheses)"
+_TITLES = {
+    "answer space": "Answers to choose from",
+    "panel": "Look of the panel",
+    "schema": "Form of the answer",
+    "frames": "Frames shown",
+    "cut": "A cut that leaves the outcome predictable",
+}
+_HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "j": "J %"}
+
+
+def hypotheses(results: Results) -> list[PrintedTable]:
+    """How answers and abstentions change when one thing of the pairs is changed step by step, beside what rules get."""
+    from traps_pipeline.scoring.doses import HYPOTHESES
+
+    return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
+
+
+def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
+    own = rows.loc[rows["hypothesis"] == hypothesis.name]
+    place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
+    own = own.assign(place=own["dose"].map(place))
+    shown = {f"{name}_shown": [_figure(row, name) for row in own.to_dict("records")] for name in (*_HEADINGS, "change")}
+    rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
+    own = own.assign(**shown, **{f"rule_{name}": values for name, values in rules.items()})
+    what = "J" if hypothesis.figure == "j" else "abstentions"
+    columns = [
+        MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),
+        Column("n_scenarios", "Scenarios", "count"),
+        *[Column(f"{name}_shown", heading, "range") for name, heading in _HEADINGS.items()],
+        Column("change_shown", f"Change of {what}", "range", group=True),
+        Column("chance", "Guess %", "percent", group=True),
+        Column("rule_value_shown", f"Best rule’s {what} %"), Column("rule_change_shown", "Largest change of a rule"),
+    ]  # fmt: skip
+    notes = [
+        f"change: in points, from “{hypothesis.doses[0].name}”, on the scenarios that both have; brackets: 95 % "
+        "interval, Bayesian bootstrap over scenarios with one unseen",
+        "rules: panel-rule, length-rule and wording-rule, each of which reads one cue and understands nothing; what a "
+        "rule gets too, a model need not understand anything for; guess: Acc of a guess among the answers offered",
+        "no part of PECS or PECS-R",
+    ]
+    if any(dose.counts_as.startswith("no void") for dose in hypothesis.doses):
+        notes.append(
+            "through a panel of these alphas the outcome is seen: FalseAbs is the share that abstains all the same"
+        )
+    refused = own.dropna(subset=["refused"]).to_dict("records")
+    notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refused]
+    rows = ordered(own, ["model", "regime", "place"])
+    name = f"hypothesis_{hypothesis.name.replace(' ', '_')}"
+    return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(own) else [], WHY)
+
+
+def _figure(row: Mapping[Any, Any], name: str) -> str:
+    own, low, high = (percent(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
+    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
+
+
+def _rule(row: Mapping[Any, Any], name: str) -> str:
+    """A rule's figure with its name, or "not run"."""
+    rule, value = row["rule" if name == "value" else "rule_changing"], percent(row[f"rule_{name}"])
+    if isinstance(rule, str):
+        return f"{value} ({rule.removesuffix('-rule')})"
+    is_reference = name == "change" and percent(row["change"]) == NONE
+    return NONE if is_reference else NOT_RUN

@@ -1,0 +1,344 @@
+"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, nearest centroids, what is only hidden; each
+beside the best of the raw inputs, the output margin and the floor of noise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS, path_name
+from traps_pipeline.protocol.datasets import ANSWERABLE, transfer_type
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables import probe_baselines
+from traps_pipeline.report.tables.control_reports import DRAWS, FEW_NOTE
+from traps_pipeline.report.tables.steering_tables import PATH, TYPE, few, short_names, why
+from traps_pipeline.report.tables.table_columns import MODEL
+from traps_pipeline.report.writing import Column, PrintedTable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
+
+
+def probes(results: Results) -> list[PrintedTable]:
+    """Probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
+    probes' controls."""
+    tables = [_transfer(results), _confabulated(results), _means(results), _within(results)]
+    return [*tables, _catch(results), _answerable(results)]
+
+
+APART = "not computed; held out: these datasets share no controls and no scenarios"
+
+
+def _few_note(marks: Sequence[str]) -> list[str]:
+    return [FEW_NOTE] if "†" in set(marks) else []
+
+
+# --- transfer ---------------------------------------------------------------------------------------------------------
+
+
+def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row per model and ordered pair: the paper's best layer, the source's own layer, and Cf->Cf at both layers."""
+    import pandas as pd
+
+    pair_rows: list[dict[str, Any]] = []
+    analyses = ("transfer", "held_out", "confabulated", "confabulated_held_out")
+    for model, of in rows.groupby("model", sort=False):
+        for source, target in TRANSFER_PAIRS:
+            pair = of.loc[(of["source"] == source) & (of["target"] == target)]
+            transfer, held_out, cf, cf_held_out = (pair.loc[pair["analysis"] == name] for name in analyses)
+            if not len(transfer):
+                continue
+            best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["source_best"]]
+            at_best, own = cf.loc[cf["all_sample_best"] & cf["value"].notna()], cf.loc[cf["own_best"]]
+            pair_rows.append(
+                {
+                    **{"model": model, "source": source, "target": target, "path": path_name(source, target)},
+                    "transfer_type": transfer_type(source, target),
+                    **_at(best, "best", ("layer", "value", "low", "high", "n_voids", "n_controls")),
+                    **_at(chosen, "source", ("layer", "value")),
+                    **_at(held_out.loc[held_out["all_sample_best"]], "held_out", ("value",)),
+                    **_at(at_best, "cf", ("layer", "value", "low", "high", "n_voids", "n_controls")),
+                    **_at(own, "cf_own", ("layer", "value")),
+                    **_at(cf_held_out.loc[cf_held_out["all_sample_best"]], "cf_held_out", ("value",)),
+                    "note": next(iter([*cf["note"].dropna(), *cf_held_out["note"].dropna()]), ""),
+                }
+            )
+    return pd.DataFrame(pair_rows)
+
+
+def _at(rows: pd.DataFrame, name: str, fields: tuple[str, ...]) -> dict[str, Any]:
+    return {f"{name}_{field}": rows[field].iloc[0] if len(rows) else np.nan for field in fields}
+
+
+def _pairs(results: Results) -> pd.DataFrame:
+    """`best_layers` with what stands beside transfer, and with the prefix cf_ beside Cf->Cf."""
+    rows = best_layers(results.probes)
+    if not len(rows):
+        return rows
+    for analysis, prefix in (
+        ("transfer", ""), ("confabulated", "cf_"), ("held_out", "held_"), ("confabulated_held_out", "cf_held_"),
+    ):  # fmt: skip
+        rows = rows.merge(probe_baselines.against(results, analysis, prefix), on=probe_baselines.KEYS, how="left")
+    marks = {"mark": few(rows, "best_n_voids", "best_n_controls"), "cf_mark": few(rows, "cf_n_voids", "cf_n_controls")}
+    return rows.assign(**marks)
+
+
+def _transfer(results: Results) -> PrintedTable:
+    rows = _pairs(results)
+    cf = [
+        Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_layer", "Cf’s own layer", "count"),
+        Column("cf_own_value", "Cf→Cf there", "fraction"),
+    ]  # fmt: skip
+    columns = [
+        MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"),
+        Column("best_value", "AUROC", "fraction", mark="mark"),
+        Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
+        Column("source_layer", "Source’s layer", "count"), Column("source_value", "AUROC there", "fraction"),
+        *_held_out(results), *probe_baselines.columns(results), *([] if results.is_study else cf),
+        Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
+    ]  # fmt: skip
+    notes = [
+        "best layer: the highest AUROC on the target itself, as in the paper; the source’s layer is the highest of its "
+        "own grouped cross-validation, which uses no label of a target",
+        *_shared_controls(results),
+        "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
+        *probe_baselines.notes(results),
+        *_few_note([] if not len(rows) else rows["mark"].tolist()),
+    ]
+    title = "Probe transfer: AUROC by ordered pair"
+    return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
+
+
+def _confabulated(results: Results) -> PrintedTable:
+    rows = _pairs(results)
+    silent: list[str] = []
+    if len(rows):
+        silent = sorted({note for note in rows["note"] if note})
+        rows = rows.loc[rows["cf_value"].notna()].reset_index(drop=True)
+    columns = [
+        MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
+        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), Column("cf_low", "from", "fraction"),
+        Column("cf_high", "to", "fraction"), *_held_out(results, "cf_"),
+        Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
+        *probe_baselines.columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
+        Column("cf_n_controls", "Controls", "count"),
+    ]  # fmt: skip
+    notes = [
+        "source and target have only the voids on which the model confabulated under standard in run 1, each with its "
+        "control; best layer: that of all samples",
+        *_shared_controls(results),
+        *silent,
+        *probe_baselines.notes(results),
+        *_few_note([] if not len(rows) else rows["cf_mark"].tolist()),
+    ]
+    absent = why(results) if results.is_study else "the paper has these figures in its table of probe transfer"
+    if results.is_study and len(results.probes):
+        absent = "; ".join(silent) or absent
+    title = "Probes on confabulated voids (Cf→Cf)"
+    rows = rows if results.is_study else rows.head(0)
+    return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=APART, deviation=DRAWS)
+
+
+def _means(results: Results) -> PrintedTable:
+    rows = _pairs(results)
+    if len(rows):
+        figures = ["best_value", "source_value", "held_out_value", "cf_value", "cf_own_value", "cf_held_out_value"]
+        figures += [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
+        figures += ["held_noise", "cf_held_noise"]
+        grouped = rows.groupby(["model", "transfer_type"], sort=False)
+        means = {name: (name, "mean") for name in figures}
+        names = {f"{prefix}raw": (f"{prefix}raw", _listed) for prefix in ("", "cf_")}
+        sides = {name: (name, "min") for name in ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")}
+        rows = grouped.agg(**means, **names, **sides, n_paths=("path", "count")).reset_index()
+        rows = rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"))
+        rows = rows.assign(cf_mark=few(rows, "cf_n_voids", "cf_n_controls"))
+    columns = [
+        MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
+        Column("source_value", "Source’s layer", "fraction", mark="mark"),
+        *_held_out(results), *probe_baselines.columns(results),
+        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
+        Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
+        *probe_baselines.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"), *_fewest(results),
+    ]  # fmt: skip
+    notes = [*_shared_controls(results), *probe_baselines.notes(results)]
+    notes += _few_note([] if not len(rows) else [*rows["mark"], *rows["cf_mark"]])
+    if results.is_study:
+        notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
+    title = "Probe transfer: means over paths"
+    return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
+
+
+def _fewest(results: Results) -> list[Column]:
+    """Items of a side in the path that has the fewest."""
+    if not results.is_study:
+        return []
+    return [
+        Column("best_n_voids", "Fewest voids", "count"), Column("best_n_controls", "Fewest controls", "count"),
+        Column("cf_n_voids", "Fewest Cf voids", "count"),
+    ]  # fmt: skip
+
+
+def _listed(names: pd.Series) -> str:
+    """The names, each once, the most frequent first."""
+    return ", ".join(name for name, _ in Counter(str(name) for name in names if name).most_common())
+
+
+def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
+    """The figure without the scored scenario, and the floor of noise under that split."""
+    if not results.is_study:
+        return []
+    noise, spread = f"{prefix}held_noise", f"{prefix}held_noise_spread"
+    return [
+        Column(f"{prefix}held_out_value", f"{head}Held out", "fraction"),
+        Column(noise, f"{head}Noise, held out", "fraction", spread=spread),
+    ]
+
+
+def _shared_controls(results: Results) -> list[str]:
+    """Notes on cross-modality pairs, which share their controls."""
+    notes = [
+        "cross-modality: both datasets have the same control items, so half of the target’s rows were used in the fit"
+    ]
+    held = "held out: at the best layer, fitted without the scored scenario, beside the floor of noise under that split"
+    return notes + [held] * results.is_study
+
+
+# --- within a dataset, centroids, what is only hidden -----------------------------------------------------------------
+
+
+def _within(results: Results) -> PrintedTable:
+    rows = results.probes
+    shuffled = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
+    table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
+    best = rows.loc[(rows["analysis"] == "within") & rows["own_best"], ["model", "source", "layer", "value"]]
+    table = table.merge(best, on=["model", "source"], how="left")
+    itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["source_best"]]
+    itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
+    table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
+    table = table.merge(probe_baselines.against(results, "held_out"), on=probe_baselines.KEYS, how="left")
+    table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
+    columns = [
+        MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
+        Column("value", "AUROC", "fraction", mark="mark"),
+        Column("shuffled", "Shuffled labels", "fraction", spread="spread"),
+    ]  # fmt: skip
+    notes = ["cross-validated, folds by scenario; shuffled: mean over shuffles and layers ± deviation over shuffles"]
+    if results.is_study:
+        columns += [
+            Column("pooled", "Over all folds", "fraction"), Column("low", "from", "fraction"),
+            Column("high", "to", "fraction"), *probe_baselines.columns(results), Column("n_voids", "Voids", "count"),
+            Column("n_controls", "Controls", "count"),
+        ]  # fmt: skip
+        notes += [
+            "AUROC: mean over folds; over all folds: of the scores of all folds together, with its 95 % interval from "
+            "resampled scenarios; baselines are to be compared with it",
+            *probe_baselines.NOTES,
+        ]
+    notes += _few_note(table["mark"].tolist())
+    title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
+    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=over)
+
+
+def _catch(results: Results) -> PrintedTable:
+    rows = _centroids(results.probes)
+    keys = ["model", "layer", "target", "sub_scenario"]
+    voids = rows.loc[rows["analysis"] == "centroid_void"].groupby(keys, sort=False)
+    table = voids.agg(rate=("value", "mean"), lowest=("value", "min"), highest=("value", "max"), n=("n_voids", "max"))
+    controls = rows.loc[rows["analysis"] == "centroid_control"].groupby(keys, sort=False)
+    alarms = controls.agg(false_alarm=("value", "mean"), n_controls=("n_controls", "max"))
+    table = table.join(alarms).reset_index()
+    table = table.merge(_caught_beside(results), on=["model", "target", "sub_scenario"], how="left")
+    table = table.assign(dataset=short_names(table["target"]), mark=few(table, "n", "n_controls"))
+    columns = [
+        MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), Column("layer", "Layer", "count"),
+        Column("rate", "Catch rate %", "percent", mark="mark"), Column("lowest", "lowest", "percent"),
+        Column("highest", "highest", "percent"), Column("false_alarm", "Controls %", "percent"),
+        *(_CAUGHT if results.is_study else ()), Column("n", "n", "count"),
+    ]  # fmt: skip
+    notes = ["voids that the source’s nearest centroid assigns to void, mean over the other datasets as sources"]
+    if results.is_study:
+        notes += [
+            "one source of each target is the other dataset of its taxonomy, which has the same controls: these shares "
+            "of controls are too low, and those of noise beside them show by how much",
+            "best raw input: the one whose catch rate is farthest above its share of controls; controls % to the right "
+            "of a baseline are its own",
+        ]
+    notes += _few_note(table["mark"].tolist())
+    return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why(results))
+
+
+_CAUGHT = (
+    Column("raw", "Best raw input"), Column("raw_void", "catches %", "percent"),
+    Column("raw_control", "its controls %", "percent"), Column("margin_void", "Output margin %", "percent"),
+    Column("margin_control", "its controls %", "percent"), Column("noise_void", "Noise %", "percent"),
+    Column("noise_control", "its controls %", "percent"),
+)  # fmt: skip
+
+
+def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of nearest centroids by sub-scenario, with the column sub_scenario."""
+    rows = rows.loc[rows["analysis"].isin(["centroid_void", "centroid_control"]) & (rows["scope"] != "all")]
+    names = rows["scope"].astype(object).str.removeprefix("sub_scenario:")
+    return rows.assign(sub_scenario=names, target=rows["target"].astype(object).fillna(""))
+
+
+def _caught_beside(results: Results) -> pd.DataFrame:
+    """One row per model, target and sub-scenario: what the best raw input, the output margin and noise catch, and the
+    share of controls that they assign to void, means over sources."""
+    import pandas as pd
+
+    keys = ["model", "target", "sub_scenario"]
+    rows = _centroids(results.baselines).astype(dict.fromkeys(("model", "features", "analysis"), object))
+    wide = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
+    wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
+    wide = wide.assign(above=wide["centroid_void"] - wide["centroid_control"])
+    raw = wide.loc[wide["features"].isin(probe_baselines.SHORTCUTS)].sort_values(
+        "above", ascending=False, kind="stable"
+    )
+    kinds = {"raw": raw.drop_duplicates(keys), "margin": wide.loc[wide["features"] == "output margin"]}
+    kinds["noise"] = wide.loc[wide["features"] == "noise"]
+    table = kinds["raw"].rename(columns={"features": "raw"})[[*keys, "raw"]]
+    for name, part in kinds.items():
+        both = part.rename(columns={"centroid_void": f"{name}_void", "centroid_control": f"{name}_control"})
+        table = table.merge(both[[*keys, f"{name}_void", f"{name}_control"]], on=keys, how="outer")
+    return table
+
+
+def _answerable(results: Results) -> PrintedTable:
+    rows = results.probes
+    own = (rows["target"] == ANSWERABLE) & rows["source_best"].eq(True)
+    table: pd.DataFrame | None = None
+    for analysis in ("answerable_void", "answerable_control"):
+        part = rows.loc[
+            own & (rows["analysis"] == analysis), [*probe_baselines.KEYS, "layer", "value", "n_voids", "n_controls"]
+        ]
+        part = part.assign(mark=few(part, "n_voids", "n_controls")).merge(
+            probe_baselines.against(results, analysis, f"{analysis}_"), on=probe_baselines.KEYS, how="left"
+        )
+        part = part.rename(columns={name: f"{analysis}_{name}" for name in ("value", "mark", "n_voids", "n_controls")})
+        table = part if table is None else table.merge(part, on=[*probe_baselines.KEYS, "layer"], how="outer")
+    assert table is not None
+    table = table.assign(dataset=short_names(table["source"]))
+    columns = [
+        MODEL, Column("dataset", "Source"), Column("layer", "Source’s layer", "count"),
+        Column("answerable_void_value", "Unanswerable against answerable", "fraction", mark="answerable_void_mark"),
+        *probe_baselines.columns(results, "answerable_void_"),
+        Column("answerable_control_value", "Answerable void against control", "fraction",
+               mark="answerable_control_mark"),
+        *probe_baselines.columns(results, "answerable_control_", "Second: "),
+        Column("answerable_void_n_controls", "Answerable", "count"),
+        Column("answerable_void_n_voids", "Voids", "count"),
+        Column("answerable_control_n_controls", "Controls", "count"),
+    ]  # fmt: skip
+    notes = [
+        "answerable: void clips of occlusion with a question that they answer. First column: the same clips with both "
+        "questions; 0.5 if a probe detects a hidden object, 1 if it detects an unknowable answer. Second: the reverse",
+        *probe_baselines.notes(results),
+        *_few_note([*table["answerable_void_mark"].dropna(), *table["answerable_control_mark"].dropna()]),
+    ]
+    absent = why(results) if results.is_study else "the paper has no such control"
+    return PrintedTable("probe_answerable", "Hidden, or unknowable", table, columns, notes, absent, deviation=DRAWS)

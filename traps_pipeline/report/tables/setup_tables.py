@@ -1,0 +1,109 @@
+"""The setup of a study: models, their parameters, and the benchmark's composition (docs/spec.md 2 and 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from traps_pipeline.models.judges import load_judges
+from traps_pipeline.models.registry import Entry, ModelEntry, load_models
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import (
+    MODEL,
+    frame,
+)
+from traps_pipeline.report.writing import Column, PrintedTable
+from traps_pipeline.storage.media import MediaSpec
+
+
+def models(results: Results) -> list[PrintedTable]:
+    """The evaluated models: provider, how a clip is shown, and the number of runs, from the registry."""
+    rows = []
+    for entry in _entries(results):
+        rows.append(
+            {
+                "model": entry.id, "provider_id": entry.endpoint, "family": entry.groups.family,
+                "access": entry.groups.access, "group": entry.groups.group, "shown": _shown(entry.media),
+                "runs": entry.runs,
+            }
+        )  # fmt: skip
+    columns = [
+        MODEL, Column("provider_id", "Asked as"), Column("family", "Family"), Column("access", "Access"),
+        Column("group", "Group"), Column("shown", "Shown"), Column("runs", "Runs at most", "count"),
+    ]  # fmt: skip
+    return [PrintedTable("models", "Models", frame(rows, ["model"]), columns, why=results.why("cells"))]
+
+
+def _shown(media: MediaSpec | None) -> str:
+    if media is None:
+        return ""
+    frames = (
+        f"{media.uniform} evenly spaced frames" if media.fps is None else f"{media.fps:g} fps, at most {media.most}"
+    )
+    return f"{media.profile}, {frames}" + (f", {media.size[0]} x {media.size[1]}" if media.size else "")
+
+
+def hyperparameters(results: Results) -> list[PrintedTable]:
+    """The parameters that models and judges are sent, and where they depart from the protocol."""
+    judges = [*load_judges().values()]
+    if results.is_study:
+        voted = set(results.bias["judge"])
+        judges = [judge for judge in judges if judge.id in voted]
+    rows = [_sent(entry, "model") for entry in _entries(results)] + [_sent(entry, "judge") for entry in judges]
+    columns = [
+        Column("id", "Participant"), Column("role", "Role"), Column("temperature", "Temperature", "fraction", 2),
+        Column("top_p", "Top-p", "fraction", 2), Column("max_tokens", "Tokens at most", "count"),
+        Column("other", "Other parameters"), Column("concurrency", "At once", "count"),
+        Column("retries", "Retries", "count"), Column("waived", "Departs"),
+    ]  # fmt: skip
+    notes = ["departs: what is sent otherwise than the paper has it, and why"]
+    return [
+        PrintedTable(
+            "hyperparameters", "Hyperparameters", frame(rows, ["id"]), columns, notes, results.why("cells"),
+            dash="not sent",
+        )
+    ]  # fmt: skip
+
+
+def _sent(entry: Entry, role: str) -> dict[str, Any]:
+    named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
+    other = {name: value for name, value in entry.params.items() if name not in named}
+    return {
+        "id": entry.id,
+        "role": role,
+        "temperature": entry.params.get("temperature"),
+        "top_p": entry.params.get("top_p"),
+        "max_tokens": entry.max_tokens or None,
+        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other.items())),
+        "concurrency": entry.limits.concurrency,
+        "retries": entry.limits.retries,
+        "waived": "; ".join(f"{name}: {reason}" for name, reason in sorted(entry.waivers.items())),
+    }
+
+
+def _flat(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {_flat(part)}" for name, part in value.items()) + "}"
+    return str(value)
+
+
+def _entries(results: Results) -> Iterable[ModelEntry]:
+    """Registry entries of the models with results, in the registry's order."""
+    evaluated = set(results.cells["model"])
+    return [entry for entry in load_models().values() if entry.id in evaluated]
+
+
+def composition(results: Results) -> list[PrintedTable]:
+    """Pairs by category."""
+    import pandas as pd
+
+    rows = results.composition
+    if len(rows):
+        total = {"taxonomy": "all", "category": "", "void": "", **rows[["n", "n_ill_posed"]].sum().to_dict()}
+        rows = pd.concat([rows, pd.DataFrame([total])], ignore_index=True)
+    columns = [
+        Column("taxonomy", "Taxonomy"), Column("category", "Category"), Column("void", "Void"),
+        Column("n", "Pairs", "count"), Column("n_ill_posed", "Ill-posed pairs", "count"),
+    ]  # fmt: skip
+    notes = ["the ill-posed datasets reuse the control clips with a question that they cannot answer"]
+    return [PrintedTable("composition", "Composition of the benchmark", rows, columns, notes, "no items yet")]

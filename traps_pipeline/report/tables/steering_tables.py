@@ -1,0 +1,240 @@
+"""Directions and steering as tables (docs/spec.md 8); probes are in `probes`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.directions import KINDS
+from traps_pipeline.mechanism.transfer_paths import path_name
+from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import MODEL, epochs, rightly_empty
+from traps_pipeline.report.writing import Column, PrintedTable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
+DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
+KIND, SET = Column("kind", "Direction"), Column("path_set", "Path set")
+NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's states were read"
+FEW = 10  # items of a side, or answers of a cell, below which a value is marked
+CELLS_NOTE = f"† and means of such cells: fewer than {FEW} answers in a cell, whose share says little"
+SETS = {"transfer": "transfer", "within_domain": "within domain"}
+
+
+def why(results: Results) -> str:
+    """The reason why a frame of what is found inside models has no rows."""
+    return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
+
+
+def few(rows: pd.DataFrame, *counts: str) -> list[str]:
+    """The mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
+    import pandas as pd
+
+    numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
+    return ["†" if any(value < FEW for value in values) else "" for values in zip(*numbers, strict=True)]
+
+
+# --- directions -------------------------------------------------------------------------------------------------------
+
+
+def cosines(results: Results) -> list[PrintedTable]:
+    """Cosines of the four void directions at the steered layer, and of standard with guided directions."""
+    import pandas as pd
+
+    rows = results.cosines
+    rows = rows.assign(name=short_names(rows["dataset"]), other=short_names(rows["other_dataset"]))
+    same = rows.loc[rows["prompt"] == rows["other_prompt"]]
+    index = ["model", "layer", "prompt", "name"]
+    wide = same.pivot_table(index=index, columns="other", values="cosine", observed=True)
+    wide = wide.reindex(columns=pd.Index([*SHORT.values()])).reset_index()
+    wide = wide.sort_values(["model", "prompt", "name"], key=_place, ignore_index=True)
+    columns = [MODEL, Column("layer", "Layer", "count"), Column("prompt", "Prompt"), Column("name", "Direction")]
+    matrix = [*columns, *(Column(short, short, "fraction", 2) for short in SHORT.values())]
+    across = rows.loc[
+        (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["dataset"] == rows["other_dataset"])
+    ]
+    across = across.sort_values(["model", "name"], key=_place, ignore_index=True)
+    pair = [
+        MODEL,
+        Column("layer", "Layer", "count"),
+        Column("name", "Direction"),
+        Column("cosine", "Cosine", "fraction", 2),
+    ]
+    absent = why(results)
+    printed = "" if results.is_study else "the paper’s text has 0.94 to 0.97 for qwen3-vl-8b"
+    return [
+        PrintedTable("cosines", "Cosines of void directions", wide, matrix, [], absent),
+        PrintedTable(
+            "cosines_standard_guided", "Standard against guided directions", across, pair, [], printed or absent
+        ),
+    ]
+
+
+def _place(values: pd.Series) -> pd.Series:
+    if values.name == "name":
+        return values.map({short: place for place, short in enumerate(SHORT.values())})
+    orders = {"prompt": PROMPTING, "kind": KINDS}
+    order = orders.get(str(values.name))
+    return values if order is None else values.map(order.index)
+
+
+# --- steering ---------------------------------------------------------------------------------------------------------
+
+
+def steering(results: Results) -> list[PrintedTable]:
+    """Abstention under steering: over all paths, by regimes, families and domains, at the largest alpha, by alpha, by
+    layer."""
+    return [
+        _shares(results),
+        _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),
+        _regimes(results, "steering_families", "Steering by the family of the direction (guided, guided)"),
+        _domains(results),
+        _top(results),
+        _dose(results),
+        _layers(results),
+    ]
+
+
+def _shares(results: Results) -> PrintedTable:
+    rows = results.shares
+    rows = rows.loc[(rows["path_set"] == "all") & (rows["directions"] == "all") & (rows["regime"] == "all")]
+    keys = ["model", "kind", "layer", "alpha"]
+    sides = [
+        rows.loc[rows["side"] == side].set_index(keys)[["abstention", "low", "high", "n_answers", "n_scenarios"]]
+        for side in ("control", "void")
+    ]
+    wide = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
+    wide = wide.sort_values(keys, key=_place, ignore_index=True)
+    columns = [MODEL, KIND, Column("layer", "Layer", "count"), Column("alpha", "α", "count")]
+    for side in ("control", "void"):
+        columns += [
+            Column(f"{side}_abstention", f"{side.capitalize()}s abstained on %", "percent"),
+            Column(f"{side}_low", "from", "percent"), Column(f"{side}_high", "to", "percent"),
+            Column(f"{side}_n_answers", "Answers", "count"), Column(f"{side}_n_scenarios", "Scenarios", "count"),
+        ]  # fmt: skip
+    notes = [
+        "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
+        "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
+    ]
+    absent = why(results) if results.is_study else "the paper prints no answers to resample"
+    return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, absent)
+
+
+def _regimes(results: Results, name: str, title: str) -> PrintedTable:
+    rows: pd.DataFrame = getattr(results, name)
+    rows = rows.assign(path_set=rows["path_set"].replace(SETS))
+    columns = [
+        MODEL, SET, *([Column("family", "Family")] if name.endswith("families") else [DIRECTIONS, INFERENCE]), KIND,
+        Column("alpha", "α", "count"), Column("control_0", "Control, α 0, %", "percent"),
+        Column("control_top", "Control, α, %", "percent"), Column("void_0", "Void, α 0, %", "percent"),
+        Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
+    ]  # fmt: skip
+    notes = ["mean over the paths of a set; +α on controls, −α on voids", *_cell_notes(results)]
+    absent = why(results)
+    if name.endswith("families") and len(results.effects):
+        absent = "no directions of the guided prompt were steered under guided inference"
+    return PrintedTable(name, title, rows, columns, notes, absent)
+
+
+def _domains(results: Results) -> PrintedTable:
+    rows = results.steering_domains
+    rows = rows.assign(path=short_names(rows["source"]))
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("path", "Direction"), Column("alpha", "α", "count"),
+        Column("same", "Same domain, controls %", "percent"),
+        Column("cross", "Cross domain, controls %", "percent"),
+    ]  # fmt: skip
+    notes = ["abstention on the well-posed dataset of the source’s own taxonomy (same) and of the other (cross)"]
+    notes += _cell_notes(results)
+    if results.is_study:
+        notes.append(
+            "judged by the panel; the paper judged its two same-domain figures by keywords, which it does not print: "
+            "no keyword judge here would be its own"
+        )
+    return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, why(results))
+
+
+def _top(results: Results) -> PrintedTable:
+    rows = effects.paths(results.effects)
+    rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
+    rows = _named(rows)
+    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_in_gaps(results)]
+    columns += [*_SIDES, *_counts(results)]
+    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
+
+
+def _dose(results: Results) -> PrintedTable:
+    rows = _named(effects.paths(results.effects))
+    columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, Column("layer", "Layer", "count")]
+    columns += [Column("alpha", "α", "count"), *_in_gaps(results)]
+    for side in _SIDES:
+        columns += [side]
+        if results.is_study:
+            columns += [
+                Column(f"{side.field}_{end}", word, "percent") for end, word in (("low", "from"), ("high", "to"))
+            ]
+    columns += _counts(results)
+    notes = [
+        epochs(results.effects),
+        *_cell_notes(results),
+        "from, to: 95 % Wilson interval" if results.is_study else "",
+    ]
+    return PrintedTable("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], why(results))
+
+
+def _layers(results: Results) -> PrintedTable:
+    rows = results.steering_layers
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("layer", "Layer", "count"), Column("alpha", "α", "count"),
+        Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
+    ]  # fmt: skip
+    notes = ["each dataset’s direction on its own controls, mean over the four splits", *_cell_notes(results)]
+    absent = "only one layer was steered" if len(results.effects) else why(results)
+    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, absent)
+    return rightly_empty(table, results.is_study and bool(len(results.effects)))
+
+
+_SIDES = (
+    Column("control", "Controls abstained on %", "percent", mark="control_mark"),
+    Column("void", "Voids abstained on %", "percent", mark="void_mark"),
+)
+
+
+def _in_gaps(results: Results) -> list[Column]:
+    """The dose in units of the class gap of the direction's own dataset; the paper does not print its gaps."""
+    return [Column("control_gaps", "in class gaps", "ratio", 2)] if results.is_study else []
+
+
+def _counts(results: Results) -> list[Column]:
+    """What stands behind a cell's two shares; the paper prints neither."""
+    if not results.is_study:
+        return []
+    return [
+        Column("control_broken", "Degenerate %, controls", "percent"), Column("void_broken", "voids", "percent"),
+        Column("control_n", "Controls", "count"), Column("void_n", "Voids", "count"),
+    ]  # fmt: skip
+
+
+def _cell_notes(results: Results) -> list[str]:
+    """How many answers a cell has at most, and what that says of all figures made of cells."""
+    counts = results.effects["n"].dropna()
+    if not len(counts):
+        return []
+    said = [f"n = {counts.max():.0f} answers per cell at most, one per scenario"]
+    return said + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
+
+
+def _named(rows: pd.DataFrame) -> pd.DataFrame:
+    names = [path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)]
+    counted = {f"{side}_mark": f"{side}_n" for side in ("control", "void") if f"{side}_n" in rows}
+    return rows.assign(path=names, **{mark: few(rows, n) for mark, n in counted.items()}).reset_index(drop=True)
+
+
+def short_names(names: Iterable[str]) -> list[str]:
+    """The datasets' short names; `not stated` for one that is not known."""
+    return [SHORT.get(name, "not stated") for name in names]

@@ -1,0 +1,169 @@
+"""Columns and sentences that many tables share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.metrics import METRIC_WORDS
+from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
+from traps_pipeline.report.writing import Behind, Column, PrintedTable, fraction
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MODEL, REGIME = Column("model", "Model", look="head"), Column("regime", "Regime", look="tag")
+DATASET = Column("title", "Dataset")
+N, MISSING, RUNS = (
+    Column("n_pairs", "n", "count"),
+    Column("n_missing", "Missing", "count"),
+    Column("n_runs", "Runs", "count"),
+)
+EPOCH = Column("epoch", "Epoch")
+SHARES = tuple(
+    Column(metric.name, metric.heading, "percent", spread=f"{metric.name}_std")
+    for metric in METRIC_WORDS.values()
+    if metric.is_share
+)
+J = Column("j", "J", "fraction", spread="j_std")
+PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark", look="strong")
+COUNTS = (N, RUNS, MISSING)
+COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
+
+
+def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
+    """The items behind a number, by the row's model and regime, and by its dataset if it has one."""
+    if field.startswith("published"):
+        return None
+    dataset = row.get("dataset")
+    side = SIDE_OF.get(field, "")
+    return Behind(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
+
+
+def marked(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with `mark`: ‡ on incomplete rows, † on other rows with missing items."""
+    incomplete = rows["incomplete"].eq(True).to_numpy(bool)
+    missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
+    return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
+
+
+def titled(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with `title`, the printed name of the dataset."""
+    return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
+
+
+def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """COUNTED for a comparison of entries: the fewest pairs and runs of any entry, the missing items of all."""
+    if not sides:
+        return dict.fromkeys(COUNTED)
+    counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
+    missing = sum(side["n_missing"] for side in sides)
+    return {**counts, "n_missing": missing, "incomplete": any(side["incomplete"] for side in sides)}
+
+
+def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
+    """Rows that compare entries, `marked` and with COUNTED. sides: for each side, the columns of rows that hold its
+    model, regime and dataset; entries: cells, and those of the dataset `overall`."""
+    import pandas as pd
+
+    by_key = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
+    keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
+    counts = [together([by_key[key] for key in of_row if key in by_key]) for of_row in keys]
+    return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
+
+
+def entries(results: Results) -> pd.DataFrame:
+    """The cells, followed by the overall rows with the dataset `overall`."""
+    import pandas as pd
+
+    return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
+
+
+def marks(rows: pd.DataFrame) -> list[str]:
+    """The meanings of the marks in these rows."""
+    return meanings(rows["mark"])
+
+
+def meanings(marks: Iterable[str]) -> list[str]:
+    """The meaning of each of these marks, once."""
+    used = set(marks)
+    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used]
+
+
+def epochs(rows: pd.DataFrame) -> str:
+    """The note on epochs: it names the single epoch, or says how epochs are mixed; empty without rows."""
+    known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
+    single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
+    if len(single) <= 1:
+        return f"epoch {single[0]}" if single else ""
+    groups: dict[str, list[str]] = {}
+    for key, part in known.groupby("dataset", sort=False) if "dataset" in known else []:
+        names = " and ".join(sorted(set(part["epoch"].astype(str))))
+        groups.setdefault(names, []).append(SHORT.get(str(key), str(key)))
+    most = max(groups, key=lambda name: len(groups[name]), default="")
+    parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != most]
+    if not parts:
+        return f"mixed epochs ({' and '.join(single)})"
+    return f"mixed epochs ({'; '.join([*parts, f'else {most}'])})"
+
+
+def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
+    """The columns to show: for a study all, for the paper's numbers those that the paper prints."""
+    whole = results.is_study or not len(rows)
+    return [c for c in columns if whole or c.field not in rows or not rows.loc[:, c.field].isna().all()]
+
+
+def best_first(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows by falling PECS, nulls last."""
+    return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
+
+
+def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """The rows sorted by these columns; datasets and regimes in the benchmark's order, models in the registry's."""
+    orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
+
+    def place(values: pd.Series) -> pd.Series:
+        order = orders.get(str(values.name))
+        return values if order is None else values.map({v: k for k, v in enumerate(order)}).fillna(len(order))
+
+    return rows.sort_values(list(by), key=place, ignore_index=True, kind="stable")
+
+
+def interval(row: Mapping[str, Any]) -> str:
+    """The interval of PECS as printed; empty if there is none."""
+    low, high = row["pecs_ci_low"], row["pecs_ci_high"]
+    return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
+
+
+def ranks(row: Mapping[str, Any]) -> str:
+    """The range of ranks that contrasts do not separate, as printed."""
+    import pandas as pd
+
+    low, high = row["rank_low"], row["rank_high"]
+    return "" if pd.isna(low) else f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}"
+
+
+def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
+    """The rows as a frame; without rows, an empty frame with these columns."""
+    import pandas as pd
+
+    return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
+
+
+def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
+    """The table; if it was run and has no rows, it prints its reason `why` instead of "not run"."""
+    return replace(table, none=table.why) if run and not len(table.rows) else table
+
+
+def no_overall(results: Results, replication: bool) -> str:
+    """Why there is no overall row."""
+    if replication:
+        return "no model of the replication families has all four datasets"
+    return "no model has all four datasets" if len(results.cells) else results.why("cells")

@@ -1,0 +1,273 @@
+"""What the paper supposes and did not measure: how abstention changes when one thing of the pairs is changed step by
+step (docs/hypotheses.md).
+
+Each hypothesis has doses, the first of which the others are compared with, on the scenarios that both have. Beside
+every figure of a model stands what the rules get, which read a cue and understand nothing, and what a guess is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.protocol.datasets import datasets_of_category
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    RESAMPLES,
+    SEED,
+    Drawn,
+    difference,
+    draw_scenarios,
+    figures_of,
+    interval,
+    limits_of,
+    run_sums,
+    shares_of,
+)
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs
+from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
+
+VISUAL = ("occlusion", "chaotic")
+RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by one cue alone
+SHOWN = ("acc", "false_abs", "abs_rec", "j")
+_SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # of `with_unseen`
+_CHANGE = (-2.0, 2.0)  # the limits of a change of J
+_KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
+
+
+@dataclass(frozen=True)
+class Dose:
+    """One step. datasets: that it is asked in, and of these one side or both. counts_as: what its items are."""
+
+    name: str
+    datasets: tuple[str, ...]
+    side: str | None = None
+    counts_as: str = "control and void"
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A hypothesis. figure: which is compared, J, or the share of abstentions whatever the side. doses: the first one
+    is the reference."""
+
+    name: str
+    figure: Literal["j", "abstains"]
+    doses: tuple[Dose, ...]
+
+
+def _void(name: str, dataset: str) -> Dose:
+    return Dose(name, (dataset,), "void", "void")
+
+
+def _no_void(name: str, dataset: str) -> Dose:
+    return Dose(name, (dataset,), "control", "no void: the outcome shows through")
+
+
+HYPOTHESES = (
+    Hypothesis(
+        "answer space",
+        "j",
+        (Dose("2 answers", ("labels_two",)), Dose("3 answers", ("labels_three",)), Dose("6 answers", ("labels_six",))),
+    ),
+    Hypothesis(
+        "panel",
+        "abstains",
+        (
+            _void("as in the pairs", "occlusion"),
+            _void("grey", "panel_grey"),
+            _void("magenta", "panel_magenta"),
+            _void("large", "panel_large"),
+            Dose("alpha 0.95", ("panel_alpha_95",), "void", "void: at most 7 of 255 levels show through"),
+            _no_void("alpha 0.8", "panel_alpha_80"),
+            _no_void("alpha 0.5", "panel_alpha_50"),
+        ),
+    ),
+    Hypothesis(
+        "schema",
+        "j",
+        (
+            Dose("as in the pairs", VISUAL),
+            Dose("final_answer", ("schema_answer",)),
+            Dose("reason, final_answer", ("schema_reason",)),
+            Dose("reason, abstain, final_answer", ("schema_abstain",)),
+        ),
+    ),
+    Hypothesis(
+        "frames",
+        "j",
+        (
+            Dose("as in the pairs", VISUAL),
+            Dose("0.1 s later", ("frames_later",)),
+            Dose("2 a second", ("frames_few",)),
+            Dose("10 a second", ("frames_all",)),
+        ),
+    ),
+    Hypothesis(
+        "cut",
+        "abstains",
+        (
+            Dose("whole clip", ("chaotic",), "control", "control"),
+            Dose("predictable cut", ("predictable_cut",), "control", "control"),
+            _void("the void's cut", "chaotic"),
+        ),
+    ),
+)
+DATASETS_READ = tuple(dict.fromkeys(name for one in HYPOTHESES for dose in one.doses for name in dose.datasets))
+
+
+def hypotheses(
+    verdicts: pd.DataFrame, offered: Mapping[str, int], resamples: int = RESAMPLES, seed: int = SEED
+) -> pd.DataFrame:
+    """HYPOTHESES rows from the VERDICTS rows of DATASETS_READ: one for each model, regime, hypothesis and dose of which
+    a dose besides the reference was asked.
+
+    offered: how many answers each item's question has, by item id. Figures are computed per run, then averaged; their
+    intervals are of resampled scenarios, in which a scenario keeps all its doses.
+    """
+    items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
+    items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
+    items["offered"] = [offered[id_] for id_ in items["item_id"]]
+    drawn = draw_scenarios(items, resamples, seed)
+    rows: list[dict[str, Any]] = []
+    for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
+        for hypothesis in HYPOTHESES:
+            found = [(dose, _items_of(group, dose)) for dose in hypothesis.doses]
+            there = [(dose, its) for dose, its in found if len(its)]
+            if {dose for dose, _ in there} - {hypothesis.doses[0], *_in_pairs(hypothesis)}:
+                reference = found[0][1]
+                made = [_row(hypothesis, dose, its, reference, drawn) for dose, its in there]
+                rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in made]
+    return _beside_rules(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
+
+
+def _in_pairs(hypothesis: Hypothesis) -> set[Dose]:
+    """Doses that are sides of the pairs, which any study has."""
+    return {dose for dose in hypothesis.doses if set(dose.datasets) <= set(VISUAL)}
+
+
+def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
+    chosen = group["dataset"].isin(dose.datasets)
+    return group.loc[chosen if dose.side is None else chosen & (group["side"] == dose.side)]
+
+
+def _row(
+    hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, drawn: Drawn
+) -> dict[str, Any]:
+    """The columns of a dose's row, those of rules aside."""
+    model, regime = (items[name].iloc[0] for name in ("model", "regime"))
+    named = f"{model}|{regime}|{hypothesis.name}"
+    figures = _figures(items, drawn, f"{named}|{dose.name}")
+    control = items["side"].eq("control").to_numpy()
+    decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
+    row: dict[str, Any] = {
+        "dose": dose.name,
+        "counts_as": dose.counts_as,
+        "n_runs": items["run"].nunique(),
+        "n_scenarios": items["scenario_id"].nunique(),
+        "n_items": items["item_id"].nunique(),
+        "n_missing": int(len(items) - decided.sum()),
+        "compared": hypothesis.figure,
+        "chance": float((1 / items.loc[control, "offered"]).mean()) if control.any() else None,
+        "panel": joined_epochs(items["panel"]),
+        "epoch": joined_epochs(items["epoch"]),
+        "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
+        "refused": None,
+        "n_compared": None,
+        "at_reference": None,
+        **dict.fromkeys(_ends("change")),
+    }
+    for name in SHOWN:
+        row |= _told(name, figures[:, RESAMPLED.index(name)], limits_of(name))
+    row["value"] = _compared(hypothesis, figures)[1, 0]
+    if dose is hypothesis.doses[0] or reference.empty:
+        return row
+    shared = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
+    mine = items.loc[items["scenario_id"].isin(shared["scenario_id"])]
+    if shared.empty:
+        return row
+    row["refused"] = _refusal(mine, shared)
+    if row["refused"] is None:
+        names = (hypothesis.doses[0].name, dose.name)
+        before, after = (
+            _compared(hypothesis, _figures(some, drawn, f"{named}|{name}"))
+            for some, name in zip((shared, mine), names, strict=True)
+        )
+        row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[1, 0]}
+        row |= _told("change", difference(after, before), _CHANGE)
+    return row
+
+
+def _figures(items: pd.DataFrame, drawn: Drawn, named: str) -> np.ndarray:
+    """The ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws): of all items per run,
+    then the mean over runs."""
+    sums = run_sums(items.assign(dataset="all"), drawn, named)
+    by_run = []
+    for of_run in sums.values():
+        rows = dict(zip(_SUMS, of_run, strict=True))
+        both = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", "_unseen")]
+        by_run.append(np.concatenate([figures_of(of_run), shares_of(np.stack(both))], axis=1))
+    return np.mean(by_run, axis=0)
+
+
+def _compared(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
+    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED.index("j")]
+
+
+def _ends(name: str) -> list[str]:
+    return [name, f"{name}_ci_low", f"{name}_ci_high"]
+
+
+def _told(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, Any]:
+    """A figure, the first of its ends, and its interval; null where it has no denominator."""
+    values = [ends[1, 0], *interval(ends[:, 1:], ends[1, 0], limits)]
+    return dict(zip(_ends(name), [None if value != value else float(value) for value in values], strict=True))
+
+
+def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
+    """Why a dose is not compared with its reference: other campaigns (docs/spec.md 9.2), panels or runs."""
+    for what, column in (("epoch", "epoch"), ("panel", "panel")):
+        own, other = (joined_epochs(some[column]) for some in (dose, reference))
+        if own != other or "+" in own:
+            return f"the dose is of {what} {own}, its reference of {what} {other}"
+    runs = [sorted(set(some["run"])) for some in (dose, reference)]
+    return None if runs[0] == runs[1] else f"the dose has runs {runs[0]}, its reference has runs {runs[1]}"
+
+
+def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with what the rules get of the same hypothesis and dose: the highest value, and the largest change, each
+    with the rule that has it. A rule does not read the regime, so one of another regime serves where there is none."""
+    of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
+    told = []
+    for row in rows.to_dict("records"):
+        same = [one for one in of_rules if all(one[name] == row[name] for name in ("hypothesis", "dose"))]
+        own = {one["model"]: one for one in sorted(same, key=lambda one: one["regime"] == row["regime"])}
+        told.append({**_best(own.values(), "value", "rule"), **_best(own.values(), "change", "rule_changing")})
+    return rows.assign(**{name: [one[name] for one in told] for name in told[0]}) if told else rows
+
+
+def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str, Any]:
+    """The rule whose value is highest, or whose change is largest, either way."""
+    known = [row for row in rows if row[field] is not None and row[field] == row[field]]
+    best = max(known, key=lambda row: abs(row[field]) if field == "change" else row[field], default=None)
+    return {named: best and best["model"], f"rule_{field}": best and best[field]}
+
+
+def wrong_rows(table: pd.DataFrame) -> int:
+    """How many rows break their definition: a share outside [0, 1], an interval out of order, a J that is not AbsRec
+    less FalseAbs, a change that is not the value less the reference's although all scenarios are compared. Null is not
+    wrong."""
+    wrong = np.zeros(len(table), bool)
+    for name in (*SHOWN, "change"):
+        figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
+        least, most = _CHANGE if name == "change" else limits_of(name)
+        wrong |= (figure < least) | (figure > most) | (low > high) | (low < least) | (high > most)
+    columns = ("j", "abs_rec", "false_abs", "change", "value", "at_reference")
+    j, abs_rec, false_abs, change, value, before = (table[name].to_numpy(float) for name in columns)
+    whole = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)
+    wrong |= np.abs(j - (abs_rec - false_abs)) > 1e-12
+    wrong |= whole & (np.abs(change - (value - before)) > 1e-12)
+    return int(wrong.sum())

@@ -1,0 +1,110 @@
+"""The tables of figures that people's labels give: the human row, the panel's errors, judge-corrected scores."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.scoring.score_rows import Bootstrap, DatasetOrOverall, Mean
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+Weighted = Annotated[float | None, "over labels, weighted so that each stratum counts as it does in the study"]
+Corrected = Annotated[float | None, "corrected for the panel's errors, mean over runs; null where undefined"]
+Judged = Annotated[float | None, "as the panel decided, mean over runs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HumanRow:
+    """People on one dataset, or overall (equal-weight mean over the four); no row means that nobody labelled."""
+
+    dataset: DatasetOrOverall
+    n_people: Annotated[int, "who labelled clips"]
+    n_labels: Annotated[int, "labels of clips"]
+    n_clips: Annotated[int, "clips labelled, each with its question"]
+    acc: Weighted
+    acc_ci_low: Bootstrap
+    acc_ci_high: Bootstrap
+    abs_rec: Weighted
+    abs_rec_ci_low: Bootstrap
+    abs_rec_ci_high: Bootstrap
+    false_abs: Weighted
+    false_abs_ci_low: Bootstrap
+    false_abs_ci_high: Bootstrap
+    j: Weighted
+    j_ci_low: Bootstrap
+    j_ci_high: Bootstrap
+    pecs: Annotated[float | None, "acc x max(0, j)"]
+    pecs_ci_low: Bootstrap
+    pecs_ci_high: Bootstrap
+    agreement: Annotated[float | None, "share of pairs of labels of a clip that agree whether it can be known"]
+    alpha: Annotated[float | None, "Krippendorff's alpha of whether it can be known"]
+    seconds: Annotated[float, "median seconds a clip"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+HUMAN_ROW = Table("human_row", HumanRow, partition_by=(), key=("dataset",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PanelErrorsRow:
+    """The panel against people on one task; no row means that it was not validated."""
+
+    task: Annotated[str, "abstention (on both sides together: a judge is not told the side) or correctness"]
+    n_answers: Annotated[int, "answers labelled, of which most people say the same"]
+    n_tied: Annotated[int, "answers left out, since as many people say yes as no"]
+    n_people: Annotated[int, "who labelled"]
+    n_yes: Annotated[int, "answers of which people say yes (abstained, correct)"]
+    sensitivity: Annotated[float | None, "share of people's yes that the panel says too, strata weighted; null if none"]
+    sensitivity_ci_low: Bootstrap
+    sensitivity_ci_high: Bootstrap
+    specificity: Annotated[float | None, "share of people's no that the panel says too, strata weighted; null if none"]
+    specificity_ci_low: Bootstrap
+    specificity_ci_high: Bootstrap
+    undefined: Annotated[str | None, "why figures cannot be corrected for it"]
+    panel: shared.Panel
+
+
+PANEL_ERRORS = Table("panel_errors", PanelErrorsRow, partition_by=(), key=("task",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectedRow:
+    """A model under a regime on one dataset, or overall, as judged and corrected for the panel's errors."""
+
+    model: shared.Model
+    regime: shared.Regime
+    dataset: DatasetOrOverall
+    n_runs: Annotated[int, "runs averaged"]
+    acc: Judged
+    acc_ci_low: Bootstrap
+    acc_ci_high: Bootstrap
+    acc_corrected: Corrected
+    acc_corrected_ci_low: Bootstrap
+    acc_corrected_ci_high: Bootstrap
+    abs_rec: Judged
+    abs_rec_ci_low: Bootstrap
+    abs_rec_ci_high: Bootstrap
+    abs_rec_corrected: Corrected
+    abs_rec_corrected_ci_low: Bootstrap
+    abs_rec_corrected_ci_high: Bootstrap
+    false_abs: Judged
+    false_abs_ci_low: Bootstrap
+    false_abs_ci_high: Bootstrap
+    false_abs_corrected: Corrected
+    false_abs_corrected_ci_low: Bootstrap
+    false_abs_corrected_ci_high: Bootstrap
+    j: Mean
+    j_ci_low: Bootstrap
+    j_ci_high: Bootstrap
+    j_corrected: Corrected
+    j_corrected_ci_low: Bootstrap
+    j_corrected_ci_high: Bootstrap
+    pecs: Judged
+    pecs_ci_low: Bootstrap
+    pecs_ci_high: Bootstrap
+    pecs_corrected: Corrected
+    pecs_corrected_ci_low: Bootstrap
+    pecs_corrected_ci_high: Bootstrap
+    panel: shared.Panel
+
+
+CORRECTED = Table("corrected", CorrectedRow, partition_by=(), key=("model", "regime", "dataset"))

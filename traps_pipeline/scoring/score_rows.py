@@ -1,0 +1,342 @@
+"""The tables of figures: metrics of cells, comparisons, the leaderboard."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+# An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
+# the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
+# a middling model on 500 pairs (0.08); beyond that, which answers were lost may matter as much as which were sampled.
+INCOMPLETE_BELOW = 0.99
+BROKEN_ABOVE = 0.01  # a model that says nothing in more of its answers than this is marked
+
+Mean = Annotated[float | None, "mean over runs"]
+Deviation = Annotated[float | None, "population standard deviation over runs"]
+Bootstrap = Annotated[
+    float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen; null without a figure"
+]
+Refused = Annotated[str | None, "why the two may not be compared"]
+DatasetOrOverall = Annotated[str, "one of four, or overall"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricsRow:
+    """A cell: one model, regime and run on one scope of a dataset."""
+
+    dataset: shared.CellDataset
+    model: shared.Model
+    regime: shared.Regime
+    run: shared.Run
+    scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
+    n_pairs: Annotated[int, "pairs in scope"]
+    n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
+    n_refused: Annotated[int, "items refused"]
+    n_empty: Annotated[int, "items answered with no text"]
+    n_truncated: Annotated[int, "items whose text was cut off before an answer"]
+    n_unfinished: Annotated[int, "items whose answer ended for a reason that no reader knows"]
+    n_degenerate: Annotated[int, "items answered with a text that says nothing: punctuation, repetition"]
+    n_unread: Annotated[int, "items answered with a text that the rule judges could not read"]
+    n_not_json: Annotated[int, "items of the JSON regime answered with a text that is not the object asked for"]
+    n_errors: Annotated[int, "items whose call failed"]
+    n_answered: Annotated[int, "items with an answer"]
+    acc: Annotated[float | None, "share of decided controls answered correctly"]
+    abs_rec: Annotated[float | None, "share of decided voids abstained on"]
+    false_abs: Annotated[float | None, "share of decided controls abstained on"]
+    j: Annotated[float | None, "abs_rec - false_abs"]
+    pecs: Annotated[float | None, "acc x max(0, j)"]
+    pecs_low: Annotated[float, "pecs of all pairs if every missing decision were the worst for the model"]
+    pecs_high: Annotated[float, "pecs of all pairs if every missing decision were the best for the model"]
+    naive: Annotated[float | None, "acc x abs_rec"]
+    n_acc: Annotated[int, "controls decided on correctness: the denominator of acc"]
+    n_false_abs: Annotated[int, "controls decided on abstention"]
+    n_abs_rec: Annotated[int, "voids decided on abstention"]
+    acc_low: Annotated[float | None, "95 % Wilson interval of this run alone, as if its pairs were independent"]
+    acc_high: shared.Wilson
+    false_abs_low: shared.Wilson
+    false_abs_high: shared.Wilson
+    abs_rec_low: shared.Wilson
+    abs_rec_high: shared.Wilson
+    panel: shared.Panels
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+METRICS = Table("metrics", MetricsRow, partition_by=("dataset",), key=("dataset", "model", "regime", "run", "scope"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContrastRow:
+    """A paired comparison of two entries of the leaderboard on one figure: two models, or two regimes of one model."""
+
+    kind: Annotated[str, "models (of one regime) or regimes (of one model)"]
+    dataset: DatasetOrOverall
+    figure: Annotated[str, "pecs or j"]
+    left_model: shared.Model
+    left_regime: shared.Regime
+    right_model: shared.Model
+    right_regime: shared.Regime
+    n_scenarios: Annotated[int | None, "scenarios that both sides answered; null where refused"]
+    difference: Annotated[float | None, "left minus right, means over runs; null where refused"]
+    ci_low: Bootstrap
+    ci_high: Bootstrap
+    p: Annotated[
+        float | None,
+        "two-sided, from the share of resamples on either side of 0 (where none lies beyond it, from a normal tail); "
+        "never below 2^(1 - n_scenarios)",
+    ]
+    p_holm: Annotated[
+        float | None,
+        "corrected by Holm over the rows of the same kind, dataset and figure (for models, also the same regime)",
+    ]
+    separable: Annotated[bool | None, "whether p_holm is below 0.05; null: too few scenarios for any answers to be"]
+    refused: Refused
+
+
+CONTRASTS = Table(
+    "contrasts",
+    ContrastRow,
+    partition_by=(),
+    key=("kind", "dataset", "figure", "left_model", "left_regime", "right_model", "right_regime"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegimeTestRow:
+    """A McNemar test of two regimes on the same items: one decision of one model in one run of a dataset."""
+
+    dataset: shared.Dataset
+    model: shared.Model
+    run: shared.Run
+    decision: Annotated[str, "void_abstention, control_abstention or correctness"]
+    left_regime: shared.Regime
+    right_regime: shared.Regime
+    n: Annotated[int, "items decided under both"]
+    only_left: Annotated[int, "items with a yes (abstained, correct) under the left regime alone"]
+    only_right: Annotated[int, "items with a yes under the right regime alone"]
+    p: Annotated[float | None, "exact two-sided binomial test of only_left against only_right; null where refused"]
+    p_holm: Annotated[float | None, "corrected by Holm over the rows of the same dataset, decision and regimes"]
+    refused: Refused
+
+
+REGIME_TESTS = Table(
+    "regime_tests",
+    RegimeTestRow,
+    partition_by=(),
+    key=("dataset", "model", "run", "decision", "left_regime", "right_regime"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeaderboardRow:
+    """A model under a regime on one dataset, or overall (equal-weight mean over the four)."""
+
+    model: shared.Model
+    regime: shared.Regime
+    dataset: DatasetOrOverall
+    n_runs: Annotated[int, "runs averaged"]
+    n_pairs: Annotated[int, "pairs per run"]
+    n_missing: Annotated[int, "items without an answer or a majority, over runs"]
+    n_refused: Annotated[int, "items refused, over runs"]
+    n_empty: Annotated[int, "items answered with no text, over runs"]
+    n_truncated: Annotated[int, "items whose text was cut off before an answer, over runs"]
+    n_unfinished: Annotated[int, "items whose answer ended for a reason that no reader knows, over runs"]
+    n_degenerate: Annotated[int, "items answered with a text that says nothing, over runs"]
+    n_unread: Annotated[int, "items answered with a text that the rule judges could not read, over runs"]
+    n_not_json: Annotated[int, "items of the JSON regime whose text is not the object asked for, over runs"]
+    n_errors: Annotated[int, "items whose call failed, over runs"]
+    answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
+    incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
+    broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
+    is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
+    acc: Mean
+    acc_std: Deviation
+    abs_rec: Mean
+    abs_rec_std: Deviation
+    false_abs: Mean
+    false_abs_std: Deviation
+    j: Annotated[float | None, "mean over runs, not clipped"]
+    j_std: Deviation
+    pecs: Annotated[float | None, "mean over runs of the per-run PECS"]
+    pecs_std: Deviation
+    acc_ci_low: Bootstrap
+    acc_ci_high: Bootstrap
+    abs_rec_ci_low: Bootstrap
+    abs_rec_ci_high: Bootstrap
+    false_abs_ci_low: Bootstrap
+    false_abs_ci_high: Bootstrap
+    j_ci_low: Bootstrap
+    j_ci_high: Bootstrap
+    pecs_ci_low: Bootstrap
+    pecs_ci_high: Bootstrap
+    rank: Annotated[
+        int | None,
+        "by PECS among the models of this regime, dataset and panel; equal values share a rank; null if of two panels",
+    ]
+    rank_low: Annotated[
+        int | None,
+        "1 + the number of models whose PECS is higher by a paired contrast that is significant after correction",
+    ]
+    rank_high: Annotated[
+        int | None,
+        "number of models minus those whose PECS is lower by such a contrast; ranks in between are not separable",
+    ]
+    pecs_low: Annotated[float, "mean over runs: pecs if every missing decision were the worst for the model"]
+    pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were the best for the model"]
+    naive: Annotated[float | None, "acc x abs_rec, mean over runs"]
+    panel: shared.Panels
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model", "regime", "dataset"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustRow:
+    """A model under a regime when shortcuts are taken away: over the four datasets and the arms that it was asked."""
+
+    model: shared.Model
+    regime: shared.Regime
+    arms: Annotated[list[str], "arms (of datasets.ARMS) in the figures; entries with other arms are not compared"]
+    n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
+    n_items: Annotated[int, "items per run, of the four datasets and the arms"]
+    n_missing: Annotated[int, "items without an answer or a majority, over runs"]
+    acc_r: Annotated[float | None, "mean over runs of Acc over answerable kinds, with equal weights"]
+    acc_r_std: Deviation
+    abs_rec_r: Annotated[float | None, "mean over runs of AbsRec over void kinds, with equal weights"]
+    abs_rec_r_std: Deviation
+    false_abs_r: Annotated[float | None, "mean over runs of FalseAbs over answerable kinds, with equal weights"]
+    false_abs_r_std: Deviation
+    pecs: Annotated[float | None, "mean over these runs of the overall PECS"]
+    pecs_std: Deviation
+    pecs_r: Annotated[float | None, "mean over runs of acc_r x max(0, abs_rec_r - false_abs_r), per run"]
+    pecs_r_std: Deviation
+    pecs_r_ci_low: Bootstrap
+    pecs_r_ci_high: Bootstrap
+    gap: Annotated[float | None, "pecs - pecs_r; null where refused"]
+    gap_std: Deviation
+    gap_ci_low: Bootstrap
+    gap_ci_high: Bootstrap
+    twin_accuracy: Annotated[
+        float | None,
+        "share of scenarios in which both the control and the twin control are correct; null without that arm",
+    ]
+    twin_accuracy_std: Deviation
+    n_twins: Annotated[int, "scenarios in which both are decided, in the run that has most"]
+    panel: shared.Panels
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+    refused: Annotated[str | None, "why there is no gap between pairs and arms"]
+
+
+ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HypothesisRow:
+    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md). No part of PECS or PECS-R."""
+
+    model: shared.Model
+    regime: shared.Regime
+    hypothesis: Annotated[str, "answer space, panel, schema, frames or cut"]
+    dose: Annotated[str, "what is changed, in words; the first dose of a hypothesis is the reference"]
+    counts_as: Annotated[str, "control and void, control, void, or why it is neither"]
+    n_runs: Annotated[int, "runs averaged"]
+    n_scenarios: Annotated[int, "scenarios"]
+    n_items: Annotated[int, "items per run"]
+    n_missing: Annotated[int, "items without an answer or a majority, over runs"]
+    acc: Annotated[float | None, "share of the controls' answers that are right"]
+    acc_ci_low: Bootstrap
+    acc_ci_high: Bootstrap
+    false_abs: Annotated[float | None, "share of controls abstained on; of what is neither, the share abstained on"]
+    false_abs_ci_low: Bootstrap
+    false_abs_ci_high: Bootstrap
+    abs_rec: Annotated[float | None, "share of voids abstained on"]
+    abs_rec_ci_low: Bootstrap
+    abs_rec_ci_high: Bootstrap
+    j: Annotated[float | None, "abs_rec - false_abs"]
+    j_ci_low: Bootstrap
+    j_ci_high: Bootstrap
+    compared: Annotated[str, "the figure that doses are compared by: j, or abstains, of all items of the dose"]
+    value: Annotated[float | None, "that figure"]
+    n_compared: Annotated[int | None, "scenarios that the dose and its reference both have; null where refused"]
+    at_reference: Annotated[float | None, "that figure at the reference, on the scenarios that both have"]
+    change: Annotated[float | None, "by how much the dose is above it; null where refused"]
+    change_ci_low: Bootstrap
+    change_ci_high: Bootstrap
+    chance: Annotated[float | None, "Acc of a guess among the answers that the questions offer"]
+    rule: Annotated[str | None, "of the rules with one cue that with the highest value here; null if none was run"]
+    rule_value: Annotated[float | None, "its value"]
+    rule_changing: Annotated[str | None, "of these rules that with the largest change, either way"]
+    rule_change: Annotated[float | None, "its change"]
+    panel: shared.Panels
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+    refused: Annotated[str | None, "why the dose is not compared with its reference"]
+
+
+HYPOTHESES = Table("hypotheses", HypothesisRow, partition_by=(), key=("model", "regime", "hypothesis", "dose"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeaveOneOutRow:
+    """A model under a regime on one dataset, or overall, scored by the other two judges; 1-1 is undecided."""
+
+    model: shared.Model
+    regime: shared.Regime
+    dataset: Annotated[str, "one of four, or overall (equal-weight mean over the four)"]
+    without: Annotated[str, "the judge left out"]
+    n_runs: Annotated[int, "runs averaged"]
+    n_pairs: Annotated[int, "pairs per run"]
+    n_missing: Annotated[int, "items without an answer or a majority of the two, over runs"]
+    n_missing_panel: Annotated[int, "items without an answer or a majority of the three, over runs"]
+    pecs: Annotated[float | None, "mean over runs of the per-run PECS of the two judges"]
+    pecs_panel: Annotated[float | None, "mean over runs of the per-run PECS of the three judges"]
+    difference: Annotated[float | None, "pecs - pecs_panel"]
+    pecs_low: Annotated[
+        float,
+        "mean over runs: pecs of the two if every missing decision were the worst for the model",
+    ]
+    pecs_high: Annotated[
+        float,
+        "mean over runs: pecs of the two if every missing decision were the best for the model",
+    ]
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+LEAVE_ONE_OUT = Table("leave_one_out", LeaveOneOutRow, partition_by=(), key=("model", "regime", "dataset", "without"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrevalenceRow:
+    """How often each axis applies to one model's sampled void failures; no row means not run."""
+
+    model: shared.Model
+    evidence: Annotated[str, "what the judge saw: trace_and_output or output; both joined by + if traces were missing"]
+    judge: shared.Judge
+    n_failures: Annotated[int, "void failures that the sample was drawn from"]
+    n_sampled: Annotated[int, "failures put to the judge"]
+    n: Annotated[int, "of these, validly labelled: every share is of n"]
+    hp: Annotated[float | None, "share with a hallucinated premise"]
+    hp_low: shared.Wilson
+    hp_high: shared.Wilson
+    ii: Annotated[float | None, "share with an invalid inference"]
+    ii_low: shared.Wilson
+    ii_high: shared.Wilson
+    hp_and_ii: Annotated[float | None, "share with both"]
+    hp_and_ii_low: shared.Wilson
+    hp_and_ii_high: shared.Wilson
+    es: Annotated[float | None, "share with epistemic surrender"]
+    es_low: shared.Wilson
+    es_high: shared.Wilson
+    doubt: Annotated[float | None, "share with doubt in the reasoning"]
+    doubt_low: shared.Wilson
+    doubt_high: shared.Wilson
+    epoch: Annotated[str, "campaigns of the answers and labels, joined by +"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+CONFABULATION_PREVALENCE = Table("confabulation_prevalence", PrevalenceRow, partition_by=(), key=("model",))

@@ -1,0 +1,28 @@
+"""All figures of a leaderboard from verdicts, as the stages of the scoring group make them one after another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pandas as pd
+
+from traps_pipeline.scoring.bootstrap import intervals, resample
+from traps_pipeline.scoring.contrasts import contrasts
+from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.scoring.standings import leaderboard
+
+
+@dataclass(frozen=True)
+class Scored:
+    """METRICS and LEADERBOARD rows of the same verdicts."""
+
+    metrics: pd.DataFrame
+    board: pd.DataFrame
+
+
+def score(verdicts: pd.DataFrame) -> Scored:
+    """The figures of VERDICTS rows of the pairs, of any models, regimes and runs."""
+    cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
+    resampled = resample(verdicts)
+    paired = contrasts(resampled, cells, verdicts)
+    return Scored(cells, leaderboard(cells, intervals(resampled), paired))

@@ -1,0 +1,135 @@
+"""Means and deviations over runs, per dataset and overall, with intervals (docs/spec.md 5.2)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
+from traps_pipeline.scoring.metrics import BOUNDS, BROKEN, COUNTED, FIGURES, decision_counts, joined_epochs, mean
+from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
+
+_RUN = ["model", "regime", "run"]
+_SUMMED = ["n_missing", "n_items", *COUNTED]
+
+
+def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
+    """LEADERBOARD rows: `standings` with their `bootstrap.intervals` and the ranks that CONTRASTS rows leave open."""
+    board = standings(metrics).merge(intervals, on=ENTRY, how="left", validate="one_to_one")
+    return board.join(_ranks(board, contrasts)).loc[:, LEADERBOARD.names]
+
+
+def standings(metrics: pd.DataFrame) -> pd.DataFrame:
+    """Every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are ignored).
+
+    Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
+    datasets within each run first; a run that lacks a dataset is left out of it, and a model and regime without a
+    complete run has no overall row. A figure that is null in one run is null here, so that every mean is over `n_runs`
+    runs. Items without a text count in no figure; where there are too many of them, the entry is `incomplete`.
+    """
+    groups = _runs(metrics).groupby(ENTRY, sort=True)
+    means, deviations = (groups[FIGURES].agg(f) for f in (mean, _deviation))
+    bounds, sums = groups[BOUNDS].agg(mean), cast(pd.DataFrame, groups[_SUMMED].sum())
+    board = means.join([deviations.add_suffix("_std"), bounds, sums])
+    board["n_runs"] = groups["run"].nunique()
+    board["n_pairs"] = groups["n_pairs"].max()
+    board["epoch"] = groups["epoch"].agg(joined_epochs)
+    board["panel"] = groups["panel"].agg(joined_epochs)
+    board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
+    board["answered"] = board["n_answered"] / board["n_items"]
+    board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
+    board["broken"] = board[[*BROKEN]].sum(axis=1) / board["n_items"]
+    board["is_broken"] = _anywhere(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
+    return board.reset_index()
+
+
+def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
+    """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
+    return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean))
+
+
+def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
+    """J of each model over all its decided items pooled, with its binomial standard error: columns model, j,
+    standard_error, n (decided items of both sides).
+
+    The error combines sqrt(p (1 - p) / n) of the two sides; it holds for answers drawn independently, as the random
+    reference strategies draw them, and shows that these are indistinguishable from J = 0 (docs/spec.md 5.3).
+    """
+    counts = cast(pd.DataFrame, decision_counts(verdicts).groupby(verdicts["model"]).sum())
+    on_void, on_control = counts["abs_rec_of"].replace(0, np.nan), counts["false_abs_of"].replace(0, np.nan)
+    abs_rec, false_abs = counts["abs_rec"] / on_void, counts["false_abs"] / on_control
+    variance = abs_rec * (1 - abs_rec) / on_void + false_abs * (1 - false_abs) / on_control
+    pooled = {
+        "j": abs_rec - false_abs,
+        "standard_error": np.sqrt(variance),
+        "n": counts["abs_rec_of"] + counts["false_abs_of"],
+    }
+    return pd.DataFrame(pooled).reset_index()
+
+
+def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
+    """One row per (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
+    cells = metrics.loc[metrics["scope"] == "all"]
+    cells = cells.assign(n_items=2 * cells["n_pairs"])
+    return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
+
+
+def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
+    """One row per (model, regime, run) that has all four datasets, in the columns of METRICS."""
+    groups = cells.groupby(_RUN, sort=True)
+    whole = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
+    counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
+    overall = whole[[*FIGURES, *BOUNDS]].agg(mean).join(counts)
+    overall["epoch"] = whole["epoch"].agg(joined_epochs)
+    overall["panel"] = whole["panel"].agg(joined_epochs)
+    overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
+    return overall.reset_index().assign(dataset="overall")
+
+
+def _anywhere(wrong: pd.Series) -> pd.Series:
+    """What is wrong with entries, on the index ENTRY; with `overall` also where it is wrong with any dataset."""
+    anywhere = cast(pd.Series, wrong.groupby(level=["model", "regime"]).transform("any")).astype(bool)
+    return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
+
+
+def _deviation(values: pd.Series) -> float:
+    return float(np.std(values.to_numpy(float)))
+
+
+def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
+    """rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there is no
+    PECS, and where the row is of several panels."""
+    known = contrasts["separable"].astype("boolean").fillna(False)
+    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & known]
+    wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
+    for row in separable.to_dict("records"):
+        winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]
+        wins[winner, row["left_regime"], row["dataset"]] += 1
+        losses[loser, row["left_regime"], row["dataset"]] += 1
+    entries = list(board[ENTRY].itertuples(index=False, name=None))
+    peers = board.groupby(["regime", "dataset", "panel"])["pecs"]
+    ranks = {
+        "rank": peers.rank(method="min", ascending=False),
+        "rank_low": pd.Series([1 + losses[entry] for entry in entries], board.index),
+        "rank_high": peers.transform("count") - pd.Series([wins[entry] for entry in entries], board.index),
+    }
+    ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
+    return pd.DataFrame(ranks).where(ranked).astype("Int64")
+
+
+def _joined_versions(versions: pd.Series) -> str:
+    """The distinct versions, sorted and joined by ` + `."""
+    return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
+
+
+def wrong_intervals(board: pd.DataFrame) -> int:
+    """How many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]); null is not wrong."""
+    wrong = 0
+    for figure in RESAMPLED:
+        low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
+        wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
+    return wrong
