@@ -13,7 +13,7 @@ from traps_pipeline.study.doctor import _damaged_history
 
 @pytest.mark.parametrize("name", ["p%41", "q?x"])
 def test_a_folder_that_dagster_would_read_as_another_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(TrapsError, match="name another folder"):
+    with pytest.raises(TrapsError, match="choose a path without it"):
         place_of(str(tmp_path / name))
 
 
