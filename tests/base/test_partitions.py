@@ -54,7 +54,7 @@ def test_a_cell_reads_as_the_design_says() -> None:
     ],
 )
 def test_a_wrong_evaluation_key_is_refused(key: str) -> None:
-    with raises(ValueError, "protocol"):
+    with raises(ValueError, "protocol.cells"):
         Evaluation.parse(key)
 
 

@@ -149,3 +149,16 @@ def test_logs_and_tracebacks_of_a_process_hold_no_key() -> None:
     assert "ERROR:root:sent 1" in ran.stderr
     assert "Bearer ***" in ran.stdout
     assert "<class 'KeyError'>" in ran.stdout
+
+
+def test_a_key_is_hidden_from_the_moment_that_it_is_set_changed_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, named = "sk-first-0123456789", "sk-second-0123456789", "quiet-0123456789"
+    assert redact(f"{first} {second}") == f"{first} {second}"
+    monkeypatch.setenv("SOME_API_KEY", first)
+    assert redact(f"{first} {second}") == f"*** {second}"
+    monkeypatch.setenv("SOME_API_KEY", second)
+    assert redact(f"{first} {second}") == f"{first} ***"
+    monkeypatch.setenv("SOME_VALUE", named)
+    assert redact(named) == named
+    redaction.hide("SOME_VALUE")
+    assert redact(named) == "***"

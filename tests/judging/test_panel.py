@@ -115,6 +115,16 @@ def test_of_two_objects_or_one_that_is_quoted_none_is_a_vote(text: str) -> None:
     assert vote("abstention", text).valid is False
 
 
+def test_a_vote_that_a_judge_quotes_from_the_answer_before_its_own_words_is_none_of_its() -> None:
+    row, asked = (
+        {"outcome": "answer", "text": f"{VOTE}\nThe response holds this vote, but it commits."},
+        f"x\n{VOTE}\ny",
+    )
+    assert parse_vote("abstention", row, ITEM, asked=asked).valid is False
+    assert parse_vote("abstention", row, ITEM, asked="left").valid is True
+    assert parse_vote("abstention", row | {"text": VOTE}, ITEM, asked=asked).valid is True
+
+
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", "1e999"])
 def test_a_number_that_is_none_makes_a_vote_invalid_and_not_wrong(value: str) -> None:
     invalid = vote("correctness", f'{{"correct": true, "extracted_value": {value}, "reasoning": ""}}')

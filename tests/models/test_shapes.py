@@ -225,6 +225,12 @@ def test_half_an_answer_is_asked_again_and_never_one(odd: Provider, finish: str)
     assert odd.stats()["requests"] == 2 and booked_usd >= odd.stats()["billed_usd"]
 
 
+def test_half_an_answer_costs_what_its_usage_says(odd: Provider) -> None:
+    odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": "abort"}])}})
+    outcome, booked_usd = booked_for(odd, "m")
+    assert outcome and booked_usd == outcome.cost_usd == pytest.approx(2 * (20e-6 + 21e-5))  # two tries
+
+
 def test_an_unknown_finish_reason_is_kept_with_its_text_and_is_no_answer(odd: Provider) -> None:
     odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": "of_the_weather"}])}})
     outcome, _ = booked_for(odd, "m")

@@ -7,6 +7,7 @@ reads them asks here, so that the same code runs from a checkout and from a whee
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
@@ -23,6 +24,7 @@ RELEASED = SCENE_SPECS / "released"
 CORRECTIONS = SCENE_SPECS / "corrections"
 # What commands write where they are told no folder: in the checkout, else below the current folder.
 WORKSPACES = (Path.cwd() if IS_INSTALLED else ROOT) / ".workspaces"
+_NO_ADDRESS = re.compile(r"\?|%[0-9A-Fa-f]{2}")
 
 
 def user_cache() -> Path:
@@ -56,3 +58,13 @@ def require_own_corrections(folder: Path = CORRECTIONS) -> Path:
     return require_own(
         folder, f"copy {OWN_SPECS} to a folder of your own, set {SPECS_VARIABLE} to it, and decide there"
     )
+
+
+def require_history_path(folder: Path) -> None:
+    """Raise TrapsError if Dagster cannot keep its history below a folder: it puts the path into an address, in which
+    `?` begins the parameters and `%41` is an A."""
+    if match := _NO_ADDRESS.search(str(folder.absolute())):
+        raise TrapsError(
+            f"{str(folder)!r}: the path holds {match[0]!r}, below which Dagster cannot keep its history; choose a path "
+            "without it (TRAPS_WORKSPACE, --workspace or DAGSTER_HOME)"
+        )

@@ -29,7 +29,7 @@ _ENCODED = re.compile(
     r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
     re.IGNORECASE,
 )
-_IGNORED = dict.fromkeys((*range(33), 127, *map(ord, "\"'`\\|")))
+_IGNORED = bytes((*range(33), 127, *b"\"'`\\|"))
 _VALUE = r"""(?=[^\s"'\\]*\d|[^\s"'\\]{16})[^\s"'\\,;&<>(){}\[\]]{6,}"""  # has a digit, or is longer than a word
 # Secrets that nobody named: in a header, a parameter or an address.
 _UNKNOWN = re.compile(
@@ -42,6 +42,7 @@ _SIGNS = ("authorization", "api", "password", "key=", "sig=", "access_token=", "
 
 _variables = set[str]()
 _values = set[str]()
+# What the needles were made of, and the needles: the environment, and how many values and variables there were.
 
 
 def hide(variable: str) -> None:
@@ -122,7 +123,6 @@ def _secrets(
 
 @lru_cache(maxsize=64)
 def _needles(secrets: frozenset[str]) -> tuple[str, ...]:
-    """Return the forms of these secrets that `_searched` text may hold."""
     needles = set[str]()
     for secret in secrets:
         for part in {secret, *re.split(r"[^!-~]+", secret)}:
@@ -143,7 +143,7 @@ def _searched(text: str, is_decoded: bool) -> str:
     """Return the printable ASCII characters of a text without white space, quotes and backslashes."""
     if is_decoded:
         text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
-    return text.encode("ascii", "ignore").decode().translate(_IGNORED)
+    return text.encode("ascii", "ignore").translate(None, _IGNORED).decode()
 
 
 def _decoded(code: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of
 
@@ -33,7 +34,7 @@ def audit_published(arguments: argparse.Namespace) -> int:
     findings = audit()
     print(audit_text(findings, arguments.all))
     if arguments.csv:
-        findings.to_csv(arguments.csv, index=False)
+        arguments.csv.write_bytes(csv_bytes(findings))
         print(f"every finding: {arguments.csv}")
     return OK
 
@@ -60,7 +61,7 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     then, now = (current(study, VERDICTS) for study in studies)
     table = version_contrasts(then, now)
     if arguments.csv:
-        table.to_csv(arguments.csv, index=False)
+        arguments.csv.write_bytes(csv_bytes(table))
     words = {True: "yes", False: "no"}
     separable = [words.get(value, "too few") for value in table["separable"]]
     separable = ["-" if p != p else word for word, p in zip(separable, table["p"], strict=True)]

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
@@ -145,7 +146,7 @@ def _shortcuts(workspace: Workspace) -> Files:
         raise TrapsError(str(error)) from error
     figure = shortcut_figure(table)
     pictures = {f"shortcuts.{kind}": figure_bytes(figure, kind) for kind in ("png", "svg")}
-    return pictures | {"shortcuts.csv": table.to_csv(index=False, float_format="%.4f").encode()}
+    return pictures | {"shortcuts.csv": csv_bytes(table, "%.4f")}
 
 
 def _page(workspace: Workspace) -> Files:

@@ -193,8 +193,8 @@ class JudgeValidationRow:
     annotator_b: Annotated[str, "second"]
     human_agreement: Annotated[float, "share of failures on which the annotators agree"]
     human_kappa: Annotated[float | None, "Cohen's kappa of the annotators; null where degenerate, and for pooled"]
-    human_kappa_low: Annotated[float | None, "95 % interval (percentile bootstrap over failures)"]
-    human_kappa_high: Annotated[float | None, "95 % interval (percentile bootstrap over failures)"]
+    human_kappa_low: Annotated[float | None, "95 % interval, failures resampled with one unseen"]
+    human_kappa_high: Annotated[float | None, "95 % interval, failures resampled with one unseen"]
     kappa_note: Annotated[str | None, "degenerate: one class has at most 2 % of either annotator's labels"]
 
 

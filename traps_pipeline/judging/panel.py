@@ -164,26 +164,30 @@ class Vote:
 Schema = TypeVar("Schema", bound=BaseModel)
 
 
-def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = None) -> Schema | str:
+def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = None, asked: str = "") -> Schema | str:
     """Return the judgement; or why it is invalid, if the judge returned anything but the schema's JSON.
 
-    thinking: the marks of the judge's thinking, which is split off first.
+    thinking: the marks of the judge's thinking, which is split off first. asked: the message to the judge; an object
+    that stands in it, and of which the judge then says something in prose, is a quotation.
     """
     if row["outcome"] not in WITH_TEXT:
         return f"judge returned {row['outcome']}"
     try:
-        answer = leading_object(strip_tokens(split_thinking(row["text"] or "", thinking).answer))
+        text = strip_tokens(split_thinking(row["text"] or "", thinking).answer)
+        answer = leading_object(text)
+        if answer and answer in asked and text.partition(answer)[2].strip("` \n"):
+            return "it begins with an object that the answer holds, and goes on in prose"
         parsed = schema.model_validate_json(answer)
     except ValidationError as error:
         return explain(error)[:200]
     return parsed if read_object(answer) is not None else "a key stands twice"
 
 
-def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None) -> Vote:
-    """Return the vote in a row of the ledger. thinking: see `parse_judgement`."""
+def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None, asked: str = "") -> Vote:
+    """Return the vote in a row of the ledger. thinking, asked: see `parse_judgement`."""
     if row["outcome"] in WITH_TEXT and row["text"] == UNREAD:
         return Vote(False, invalid_reason=UNREAD)
-    vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row, thinking)
+    vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row, thinking, asked)
     if isinstance(vote, str):
         return Vote(False, invalid_reason=vote)
     if isinstance(vote, AbstentionVote):
@@ -211,7 +215,7 @@ class Ballot(Call):
 
     def vote(self, row: Row) -> Vote:
         """The vote that the judge returned."""
-        return parse_vote(self.task, row, self.item, thinking_of(self.judge))
+        return parse_vote(self.task, row, self.item, thinking_of(self.judge), self.request.user)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import pandas as pd
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.agreement import cohen_kappa
@@ -71,7 +72,7 @@ def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
     """The rows that an annotator fills in: SHEET_COLUMNS by failure, of `sheet_rows`, safe for a spreadsheet."""
     empty = dict.fromkeys(LABEL_COLUMNS, "")
     return [
-        empty | {name: _no_formula(text) for name, text in row.items()} | {"sample_id": row["sample_id"]}
+        empty | {name: str(no_formula(text)) for name, text in row.items()} | {"sample_id": row["sample_id"]}
         for row in sheet_rows(workspace)
     ]
 
@@ -100,11 +101,6 @@ def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
     """The texts of an item's row; empty if there is no row."""
     rows = frame.loc[frame["item_id"] == item_id].to_dict("records")
     return {name: value for row in rows for name, value in row.items() if isinstance(value, str)}
-
-
-def _no_formula(text: str) -> str:
-    """The text with a leading `'` if a spreadsheet would execute it as a formula."""
-    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
@@ -251,19 +247,24 @@ def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
-    """Cohen's kappa and its 95 % percentile interval over resampled failures; NaN where degenerate."""
+    """Return Cohen's kappa and its 95 % interval, a Bayesian bootstrap over failures; NaN where degenerate.
+
+    One failure is unseen: at the lower end the annotators differ on it, at the upper end they agree. So the interval
+    keeps a width where they always agree.
+    """
     if is_degenerate(one, other):
         return np.nan, np.nan, np.nan
-    n = len(one)
-    cells = np.bincount(2 * one.astype(int) + other, minlength=4)
-    drawn_cells = np.random.default_rng(SEED).multinomial(n, cells / n, size=RESAMPLES)
-    no_no, no_yes, yes_no, yes_yes = drawn_cells.T / n
-    p, q = yes_no + yes_yes, no_yes + yes_yes
+    cells = np.bincount(2 * one.astype(int) + other, minlength=4)  # no and no, no and yes, yes and no, yes and yes
+    rng = np.random.default_rng(SEED)
+    drawn, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
+    shares = drawn + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
+    shares /= shares.sum(axis=-1, keepdims=True)
+    p, q = shares[..., 2] + shares[..., 3], shares[..., 1] + shares[..., 3]
     chance = p * q + (1 - p) * (1 - q)
-    defined = chance < 1
-    draws = (no_no + yes_yes - chance)[defined] / (1 - chance[defined])
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return cohen_kappa(one.astype(int), other.astype(int)), float(low), float(high)
+    draws = (shares[..., 0] + shares[..., 3] - chance) / (1 - chance)
+    kappa = cohen_kappa(one.astype(int), other.astype(int))
+    low, high = np.quantile(draws[1:3].min(axis=0), 0.025), np.quantile(draws[[0, 3]].max(axis=0), 0.975)
+    return kappa, min(float(low), kappa), max(float(high), kappa)
 
 
 def _share(part: int, whole: int) -> float:

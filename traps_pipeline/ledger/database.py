@@ -169,12 +169,12 @@ class Database(ABC):
 
     def _begin(self) -> None:
         self.session = secrets.token_hex(8)
-        self.run(self._prepare)
+        self.run(self.prepare)
         self._session_lock = self.try_lock(f"session-{self.session}")
         self._thread = threading.Thread(target=self._work, name="ledger", daemon=True)
         self._thread.start()
 
-    def _prepare(self, connection: sa.Connection) -> None:
+    def prepare(self, connection: sa.Connection) -> None:
         """Create missing tables, and the rows of the study and of this session."""
         METADATA.create_all(connection)
         self.study = (

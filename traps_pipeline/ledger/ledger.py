@@ -115,8 +115,8 @@ class Ledger:
         Raises TrapsError."""
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._mine(TOTALS))):
-            its = row._mapping
-            means = {name: (its[f"{name}_sum"], its[f"{name}_n"]) for name in AVERAGED if its[f"{name}_n"]}
+            sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
+            means = {name: its for name, its in sums.items() if its[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals
 

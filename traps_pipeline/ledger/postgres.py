@@ -190,10 +190,10 @@ class PostgresDatabase(Database):
         """See `Database.now_s`."""
         return float(connection.execute(sa.text("select extract(epoch from clock_timestamp())")).scalar_one())
 
-    def _prepare(self, connection: sa.Connection) -> None:
+    def prepare(self, connection: sa.Connection) -> None:
         # Processes that begin at once would each create the tables, or the study's row.
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(lock_number("schema"))))
-        super()._prepare(connection)
+        super().prepare(connection)
 
     # --- the connection -----------------------------------------------------------------------------------------------
 

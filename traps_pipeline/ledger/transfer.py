@@ -68,8 +68,8 @@ def _copy(source: Database, batch: Batch, place: str) -> int:
     mine = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
     if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(mine)).limit(1)).first():
         raise TrapsError(
-            f"{place}: holds rows of this study already; bring answers into it with `traps answers export` and "
-            "`traps answers import`"
+            f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
+            "one by one with `traps answers import`"
         )
     # Those that were opened and got no row would be in the way of the source's.
     batch.connection.execute(sa.delete(EVALUATIONS).where(EVALUATIONS.c.study == batch.study))

@@ -120,8 +120,8 @@ class GateRow(Extracted):
     false_abs: Share
     abs_rec: Share
     pecs: Share
-    pecs_low: Annotated[float | None, "95 % percentile interval from resampled scenarios, the gate held fixed"]
-    pecs_high: Annotated[float | None, "95 % percentile interval from resampled scenarios, the gate held fixed"]
+    pecs_low: Annotated[float | None, "95 % interval, scenarios resampled with one unseen, the gate held fixed"]
+    pecs_high: Annotated[float | None, "95 % interval, scenarios resampled with one unseen, the gate held fixed"]
     plain_acc: Annotated[float | None, "without the gate"]
     plain_false_abs: Annotated[float | None, "without the gate"]
     plain_abs_rec: Annotated[float | None, "without the gate"]
@@ -179,8 +179,8 @@ class PatchingRow(Extracted):
     effect: Annotated[
         float | None, "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it"
     ]
-    low: Annotated[float | None, "95 % percentile interval from resampled scenarios"]
-    high: Annotated[float | None, "95 % percentile interval from resampled scenarios"]
+    low: Annotated[float | None, "95 % interval, pairs resampled with one unseen"]
+    high: Annotated[float | None, "95 % interval, pairs resampled with one unseen"]
     flips: Annotated[
         float | None, "share of pairs whose sides differ in the sign of the outcome in which the patch changes the sign"
     ]

@@ -176,6 +176,13 @@ class Outcomes:
         found["pecs"] = found["acc"] * np.maximum(0, found["abs_rec"] - found["false_abs"])
         return found
 
+    def counts(self) -> np.ndarray:
+        """Return how often each item is yes and is decided for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""
+        parts = ((~self.void, self.correct), (~self.void, self.abstained), (self.void, self.abstained))
+        decided = [side & np.isfinite(values) for side, values in parts]
+        yes = [np.where(made, values, 0.0) for made, (_, values) in zip(decided, parts, strict=True)]
+        return np.stack([column for pair in zip(yes, decided, strict=True) for column in pair], axis=-1).astype(float)
+
 
 def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
     """(coverage, risk, answers kept) where answers are given up from the highest score down.

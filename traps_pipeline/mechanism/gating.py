@@ -39,12 +39,20 @@ from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.scoring.bootstrap import TAXONOMIES, percentiles, scenario_weights
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    draw_scenarios,
+    figures_of,
+    interval,
+    resampled_sums,
+    with_unseen,
+)
 from traps_pipeline.storage.workspace import Workspace
 
 STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
 COVERAGES = tuple(k / 20 for k in range(1, 21))
 ALL = "all"
+_PECS = RESAMPLED.index("pecs")
 
 
 @dataclass(frozen=True)
@@ -221,10 +229,6 @@ def _rows(
         of_datasets: list[dict[str, float]] = []
         draws: list[np.ndarray] = []
         for target, (decisions, layer) in made.items():
-            scenario, index = pd.factorize(names[decisions.place])
-            # The datasets of a taxonomy share their resamples, and taxonomies do not.
-            drawn_by = [seed, TAXONOMIES.index(probed_taxonomy(target))]
-            weight = scenario_weights(len(index), resamples, drawn_by)[:, scenario]
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
             gated = outcome.gated(gate)
@@ -235,13 +239,15 @@ def _rows(
             values = {name: value.item() for name, value in figures.items()}
             values |= {f"plain_{name}": value.item() for name, value in plain_figures.items()}
             values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
-            drawn = gated.figures(weight)["pecs"] if target in DATASETS else np.full(resamples, np.nan)
+            about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
+                sums = _resampled(gated, target, names[decisions.place], resamples, seed)
+                about_pecs = interval(figures_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 of_datasets.append(values)
-                draws.append(drawn)
+                draws.append(figures_of(sums, in_mean=True)[:, _PECS, 1:])
             area = separation(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
-            rows.append(_row(states, (*about, threshold, target), layer, area, values, drawn, sides))
+            rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
         if len(of_datasets) == len(DATASETS):
             means = {name: float(np.mean([one[name] for one in of_datasets])) for name in of_datasets[0]}
             sides = [
@@ -250,12 +256,22 @@ def _rows(
             ]
             layers = {layer for target, (_, layer) in made.items() if target in DATASETS}
             layer = layers.pop() if len(layers) == 1 else -1
-            rows.append(
-                _row(
-                    states, (*about, threshold, ALL), layer, np.nan, means, np.mean(draws, axis=0), (sides[0], sides[1])
-                )
-            )
+            about_pecs = interval(np.mean(draws, axis=0), means["pecs"], (0.0, 1.0))
+            rows.append(_row(states, (*about, threshold, ALL), layer, np.nan, means, about_pecs, (sides[0], sides[1])))
     return rows
+
+
+def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
+    """Return resampled sums of a dataset's outcomes with an unseen scenario, (9, 1 + resamples). The datasets of a
+    taxonomy share their resamples, and taxonomies do not. scenarios: (n,), of each item."""
+    taxonomy = probed_taxonomy(target)
+    drawn = draw_scenarios(pd.DataFrame({"scenario_id": scenarios, "taxonomy": taxonomy}), resamples, seed)
+    ids, weights = drawn.scenarios[taxonomy]
+    counts = np.zeros((len(ids), 6))
+    np.add.at(counts, ids.get_indexer(pd.Index(scenarios)), outcomes.counts())
+    having = (counts[:, 1::2] > 0).sum(axis=0)
+    sums = resampled_sums(weights, counts[:, None])[0]
+    return with_unseen(sums, having, drawn.unseen(f"gate|{target}", decisions=3))
 
 
 def _row(
@@ -264,10 +280,10 @@ def _row(
     layer: int,
     area: float,
     values: Mapping[str, float],
-    draws: np.ndarray,
+    about_pecs: np.ndarray,
     sides: tuple[int, int],
 ) -> GateRow:
-    low, high = percentiles(draws)
+    low, high = about_pecs
     figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
     named: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(

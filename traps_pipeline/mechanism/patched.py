@@ -24,7 +24,13 @@ from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
-from traps_pipeline.scoring.bootstrap import percentiles, scenario_weights
+from traps_pipeline.scoring.bootstrap import (
+    TAXONOMIES,
+    draw_scenarios,
+    interval,
+    shares_of,
+    with_unseen,
+)
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.workspace import Workspace
 
@@ -208,14 +214,15 @@ def effect_of(
 ) -> tuple[float | None, float | None, float | None]:
     """The indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each): sum(after - before)
     over sum(there - before), each (pairs,). A ratio of sums, since the ratio of a pair whose sides hardly differ is
-    noise. None where the sides do not differ at all; and an end of the interval that comes from resamples in which they
-    do not, shares of nothing, is None too."""
+    noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's width. None where the
+    sides do not differ at all."""
     moved, apart = after - before, there - before
     if not apart.sum():
         return None, None, None
-    weights = scenario_weights(len(moved), RESAMPLES, seed).astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = (
-            end if np.isfinite(end) else None for end in percentiles((weights @ moved) / (weights @ apart)).tolist()
-        )
-    return float(moved.sum() / apart.sum()), low, high
+    effect = float(moved.sum() / apart.sum())
+    pairs = pd.DataFrame({"scenario_id": np.arange(len(moved)), "taxonomy": TAXONOMIES[0]})
+    drawn = draw_scenarios(pairs, RESAMPLES, seed)
+    sums = drawn.scenarios[TAXONOMIES[0]][1] @ np.stack([moved, apart], axis=-1)
+    ends = shares_of(with_unseen(sums.T, np.array([len(moved)]), drawn.unseen("effect", decisions=1)))
+    low, high = interval(ends[:, 0, 1:], effect, (-np.inf, np.inf))
+    return effect, float(low), float(high)

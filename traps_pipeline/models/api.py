@@ -161,7 +161,8 @@ class ApiBackend:
             raise self._malformed(str(error), exchange.content) from None
         if reply.ending == "transient":
             self._tell("ended", f"its answer ended with {reply.finish!r} and is asked again")
-            raise TransientError(f"ended_{reply.finish.strip().lower()}")
+            cost_usd = self._outcome(reply, request).cost_usd
+            raise TransientError(f"ended_{reply.finish.strip().lower()}", cost_usd=cost_usd)
         return self._outcome(reply, request)
 
     def _malformed(self, why: str, content: bytes = b"") -> TransientError:

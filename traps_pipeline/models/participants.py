@@ -159,7 +159,7 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
         elif failure.kind != UNREACHABLE:
             participant.breaker.connected()
         if failure.billed:
-            lost_usd += worst_case_usd(participant.entry, request)
+            lost_usd += _believed(failure.cost_usd, worst_case_usd(participant.entry, request))
         malformed += failure.kind == MALFORMED
         if number > limits.retries or malformed == MALFORMED_TRIES:
             return _given_up(failure.kind, number, seconds, lost_usd, failure.raw)
@@ -209,8 +209,7 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
                 raise TransientError(UNREACHABLE, billed=False, why=why) from None
             raise TransientError("timeout") from None
         except TransientError as failure:
-            if not failure.billed:
-                cost_usd = 0.0
+            cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise
         finally:
             if exchange.never_left:  # a call that is cancelled before it is sent, too

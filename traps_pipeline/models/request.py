@@ -97,8 +97,8 @@ class Outcome:
 class TransientError(Exception):
     """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection, an answer out of order.
 
-    billed: whether the provider may charge for it; raw: see `Outcome`; why: what is wrong, or what kept a call from
-    leaving, for a person.
+    billed: whether the provider may charge for it; cost_usd: what it charges where an answer says so, else the worst
+    case counts; raw: see `Outcome`; why: what is wrong, or what kept a call from leaving, for a person.
     """
 
     def __init__(
@@ -107,11 +107,13 @@ class TransientError(Exception):
         retry_after_s: float | None = None,
         *,
         billed: bool = True,
+        cost_usd: float | None = None,
         raw: str | None = None,
         why: str = "",
     ) -> None:
         super().__init__(kind)
         self.kind, self.retry_after_s, self.billed, self.raw, self.why = kind, retry_after_s, billed, raw, why
+        self.cost_usd = cost_usd
 
     @property
     def outcome(self) -> Outcome:

@@ -17,6 +17,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.databases import database_error, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
+from traps_pipeline.base.paths import require_history_path
 from traps_pipeline.models.traffic import remembering_stops
 from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.history import History
@@ -46,6 +47,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     Raises TrapsError when the history cannot be read or written.
     """
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    require_history_path(home)
     try:
         workspace.locks.mkdir(parents=True, exist_ok=True)
         with (workspace.locks / "dagster.lock").open("w") as lock:

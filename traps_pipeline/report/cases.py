@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
@@ -99,7 +100,7 @@ def cases_files(workspace: Workspace, clips: str | None) -> dict[str, bytes]:
         for kind, title in KINDS.items()
     ]
     page = environment().get_template("cases.html.j2").render(kinds=kinds, most=SHOWN, clips=clips)
-    return {"cases.html": page.encode(), "cases.csv": found.to_csv(index=False).encode()}
+    return {"cases.html": page.encode(), "cases.csv": csv_bytes(found)}
 
 
 def _case(row: dict[Any, Any], items: dict[str, Any], texts: dict[tuple[Any, ...], Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import finalized, plain, text_table
 from traps_pipeline.report.numbers import NONE, as_numbers
 
@@ -200,7 +201,7 @@ def table_files(table: PrintedTable) -> dict[str, bytes]:
     """The table as `name.parquet`, `name.csv` (shares as fractions), `name.tex` (booktabs) and `name.md`."""
     files = {
         "parquet": _parquet(table),
-        "csv": table.data.to_csv(index=False).encode(),
+        "csv": csv_bytes(table.data),
         "tex": table_latex(table).encode(),
         "md": table_markdown(table).encode(),
     }

@@ -10,25 +10,19 @@ from urllib.parse import urlsplit
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import LONGEST
-from traps_pipeline.base.paths import user_cache
+from traps_pipeline.base.paths import require_history_path, user_cache
 
 STUDY = "study.yaml"
 SCRATCH = "TRAPS_SCRATCH"  # names the folder in which the files of object stores are while they are used
 SCHEMES = ("s3", "gs", "az")
 Place = Path | str  # a folder, or an address s3://bucket/study
 
-# Dagster puts a folder into an SQLite URL as it is: its history would lie in another folder.
-_CHANGED_BY_DAGSTER = re.compile(r"\?|%[0-9a-fA-F]{2}")
-
 
 def place_of(text: str) -> Place:
     """What a person names: an address in an object store, or a folder. Raises TrapsError for another address."""
     if "://" not in text:
         folder = Path(text).absolute()
-        if _CHANGED_BY_DAGSTER.search(str(folder)):
-            raise TrapsError(
-                f"{folder}: Dagster reads ? and % with two hexadecimal digits as codes; name another folder"
-            )
+        require_history_path(folder)
         return folder
     address = urlsplit(text.rstrip("/"))
     if address.scheme not in SCHEMES or not address.netloc or address.query or address.username:

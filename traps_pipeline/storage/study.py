@@ -216,7 +216,7 @@ class Study(BaseModel):
     database: str | None = Field(
         default=None,
         pattern=r"^[A-Z][A-Z0-9_]*$",
-        description="variable that holds the address of the PostgreSQL database with the ledger; `traps ledger move`",
+        description="variable that holds the address of the PostgreSQL database with the ledger (docs/cluster.md)",
     )
     allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
     mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")

@@ -16,7 +16,7 @@ import yaml
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.base.paths import ROOT, WORKSPACES, require_root
+from traps_pipeline.base.paths import ROOT, WORKSPACES, require_history_path, require_root
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
@@ -91,6 +91,7 @@ class Workspace:
                     )
             return workspace
         study = study.model_copy(update={"name": study.name or name_of(place)})
+        require_history_path(Path(os.environ.get("DAGSTER_HOME") or ("." if isinstance(place, str) else place)))
         if isinstance(place, str):
             study = study.model_copy(update={"database": study.database or DATABASE})
             workspace = cls(scratch_of(place), study, place)

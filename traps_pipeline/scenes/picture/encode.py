@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing
 from traps_pipeline.scenes.picture.policies import SAMPLED, FramePolicy
 
@@ -37,8 +38,15 @@ def frames_digest(frames: Sequence[np.ndarray]) -> str:
 def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
     """Write RGB frames (F, H, W, 3) as an mp4 (H.264, yuv420p, faststart); the file appears whole or not at all.
 
-    Raises TrapsError when it cannot be written (a full disk); a former file then still stands.
+    Raises TrapsError when it cannot be written (a full disk); a former file then still stands. Raises TrapsError, too,
+    for a width or height that is odd, before anything is written.
     """
+    height, width = frames[0].shape[:2]
+    if height % 2 or width % 2:
+        raise TrapsError(
+            f"{path.name}: the frames are {width} x {height} pixels, and H.264 needs an even width and an even height; "
+            f"draw them at {width + width % 2} x {height + height % 2}"
+        )
     import av
     from av.error import FFmpegError
 
@@ -46,7 +54,7 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
         try:
             with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 stream = container.add_stream("libx264", rate=fps, options=ENCODER)
-                stream.height, stream.width = frames[0].shape[:2]
+                stream.height, stream.width = height, width
                 stream.pix_fmt = "yuv420p"
                 stream.codec_context.thread_count = 1
                 for frame in frames:

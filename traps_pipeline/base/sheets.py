@@ -1,0 +1,18 @@
+"""Write CSV files that a spreadsheet opens without running what is in them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def no_formula(value: object) -> object:
+    """Return a text with a leading `'` if a spreadsheet would execute it as a formula; anything else as it is."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+
+
+def csv_bytes(table: pd.DataFrame, float_format: str | None = None) -> bytes:
+    """Return a table as CSV with a heading: texts may come from models, and none is a formula."""
+    return table.map(no_formula).to_csv(index=False, float_format=float_format).encode()
