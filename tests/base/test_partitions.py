@@ -49,12 +49,18 @@ def test_a_cell_reads_as_the_design_says() -> None:
     "key",
     [
         *("m__guided", "m__guided__1", "m__guided__runx", "m__guided__run", "m__guided__run0", "m__guided__run01"),
-        *("m__guided__run²", "m__warm__run1", "M__guided__run1", "a b__guided__run1", "a__b__guided__run1"),
+        *("m__guided__run²", "m__warm__run1"),
         *("__guided__run1", "m__guided__run1__x", "m__guided__run-1", "", "m__guided__run1\n"),
     ],
 )
 def test_a_wrong_evaluation_key_is_refused(key: str) -> None:
     with raises(ValueError, "protocol.cells"):
+        Evaluation.parse(key)
+
+
+@pytest.mark.parametrize("key", ["M__guided__run1", "a b__guided__run1", "a__b__guided__run1"])
+def test_a_key_with_a_wrong_name_is_refused(key: str) -> None:
+    with raises(ValueError, "base.names.check_name"):
         Evaluation.parse(key)
 
 

@@ -46,7 +46,7 @@ with _stopped_alike():
 @pytest.fixture
 def tree(tmp_path: Path) -> tuple[subprocess.Popen[bytes], int]:
     """The first process of COMMAND, started where SIGINT is ignored, and the id of the second one."""
-    ready, mark = tmp_path / "ready", tmp_path.name
+    ready, mark = tmp_path / "ready", str(tmp_path)
     script = f'trap "" INT; exec {sys.executable} -c "$0" "$1"'
     process = subprocess.Popen(["sh", "-c", script, COMMAND, ready], env=os.environ | {MARK: mark})
     until = time.monotonic() + END_S
@@ -65,7 +65,7 @@ def test_a_stop_of_either_process_ends_all_that_both_started(
     first, second = tree
     os.kill(first.pid if which == "first" else second, stop)
     assert first.wait(END_S) != 0
-    wait_until_gone(tmp_path.name, END_S)
+    wait_until_gone(str(tmp_path), END_S)
 
 
 def test_the_first_process_ends_with_the_code_of_the_second() -> None:

@@ -52,7 +52,7 @@ def test_a_ledger_goes_through_a_file_with_all_that_was_paid(asked: Ledger, plac
 def test_nothing_is_moved_into_a_study_that_has_answers_or_while_somebody_asks(asked: Ledger, tmp_path: Path) -> None:
     other = local(tmp_path / "other")
     write(other, answer("a", "right"))
-    with pytest.raises(TrapsError, match=r"holds rows of this study already; bring answers into it with .*import"):
+    with pytest.raises(TrapsError, match="holds rows of this study already"):
         copy_ledger(asked.database, other.database)
     assert [row["text"] for row in other.read("m").rows.values()] == ["right"]
 

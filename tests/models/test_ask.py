@@ -333,7 +333,6 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.base.partitions import Cell, Evaluation
 from tests.build.ledger import local
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study

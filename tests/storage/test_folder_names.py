@@ -14,7 +14,7 @@ from traps_pipeline.study.doctor import _damaged_history
 
 @pytest.mark.parametrize("name", ["p%41", "q?x"])
 def test_a_folder_that_dagster_would_read_as_another_is_refused(tmp_path: Path, name: str) -> None:
-    with raises(TrapsError, "storage.place.place_of"):
+    with raises(TrapsError, "base.paths.require_history_path"):
         place_of(str(tmp_path / name))
 
 

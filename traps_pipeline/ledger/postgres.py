@@ -191,6 +191,7 @@ class PostgresDatabase(Database):
         return float(connection.execute(sa.text("select extract(epoch from clock_timestamp())")).scalar_one())
 
     def prepare(self, connection: sa.Connection) -> None:
+        """See `Database.prepare`."""
         # Processes that begin at once would each create the tables, or the study's row.
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(lock_number("schema"))))
         super().prepare(connection)

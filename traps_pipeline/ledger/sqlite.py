@@ -28,9 +28,10 @@ WAIT_S = 600.0  # for another process's transaction, on however slow a disk
 
 
 class SqliteDatabase(Database):
-    """The ledger in a folder. folder: made when something is written."""
+    """The ledger in a folder, which is made when something is written. A file holds one study, whatever that is called:
+    it can be copied into the folder of another."""
 
-    def __init__(self, folder: Path, study: str, file: str = FILE) -> None:
+    def __init__(self, folder: Path, study: str = "study", file: str = FILE) -> None:
         super().__init__(study)
         self.folder, self.path = folder, folder / file
         self._connection: sa.Connection | None = None

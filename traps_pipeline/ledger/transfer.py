@@ -24,14 +24,14 @@ def export_ledger(ledger: Database, file: Path) -> int:
     """Write a ledger to a file (SQLite), which must not exist; the number of rows. Raises TrapsError."""
     if file.exists():
         raise TrapsError(f"{file}: is there already; name another file")
-    return copy_ledger(ledger, SqliteDatabase(file.parent, ledger.study_name, file.name))
+    return copy_ledger(ledger, SqliteDatabase(file.parent, file=file.name))
 
 
 def import_ledger(file: Path, ledger: Database) -> int:
     """Read the ledger of a file into a study that has none; the number of rows. Raises TrapsError."""
     if not file.is_file():
         raise TrapsError(f"{file}: no such file; name one that `traps ledger export` wrote")
-    source = SqliteDatabase(file.parent, "", file.name)
+    source = SqliteDatabase(file.parent, file=file.name)
     with source.read() as connection:
         names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()]
     if len(names) != 1:

@@ -237,7 +237,7 @@ class Workspace:
 
         if self.study.database:
             return postgres_of(self.study.database, self.study.name)
-        return SqliteDatabase(self.ledger_folder, self.study.name)
+        return SqliteDatabase(self.ledger_folder)
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
         """File that exists while a check of a partition does not pass; it holds the details."""
