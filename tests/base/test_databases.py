@@ -33,11 +33,11 @@ def test_a_full_disk_is_named_without_the_statement(tmp_path: Path) -> None:
     assert reason_and_remedy(of_postgres) == FULL
 
 
-def test_any_other_error_keeps_the_words_of_the_database_alone(tmp_path: Path) -> None:
+def test_a_damaged_file_is_moved_away_and_any_other_error_keeps_the_words_of_the_database(tmp_path: Path) -> None:
     (tmp_path / "a.db").write_bytes(b"no database at all" * 100)
     with pytest.raises(sqlite3.DatabaseError) as raised:
         sqlite3.connect(tmp_path / "a.db").execute("select * from a")
-    assert reason_and_remedy(raised.value)[0] == "file is not a database"
+    assert reason_and_remedy(raised.value)[1] == "move that file away, or restore a copy of it"
     engine = sqlalchemy.create_engine(f"sqlite:///{tmp_path / 'b.db'}")
     with pytest.raises(OperationalError) as failed, engine.begin() as connection:
         connection.exec_driver_sql("select * from a where b = ?", ("secret",))

@@ -144,7 +144,7 @@ def test_values_that_no_table_holds_are_unknown_and_told(ledger: Ledger) -> None
     odd = {"prompt_tokens": 2**63, "completion_tokens": -1, "served_model": 5, "cost_usd": -1000.0}
     write(ledger, answer("a", "left"))
     content = encoded(answer("a", "left") | odd)  # as no version writes it
-    damage(ledger, "a", content, digest_of(content, None, None))
+    damage(ledger, "a", content, digest_of("a", content, None, None))
     known = ledger.read("m")
     assert known.rows["a"] == answer("a", "left") | dict.fromkeys(odd)
     (note,) = known.notes.values()

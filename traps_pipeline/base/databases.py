@@ -26,6 +26,8 @@ def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):
             return reason, remedy, True
+    if re.search(r"not a database|disk image is malformed", words, re.IGNORECASE):
+        return "it is damaged, or no database", "move that file away, or restore a copy of it", False
     if re.search(_SERVER, words, re.IGNORECASE):
         return words, "see that the server runs and that address, user and password are right on this host", False
     return words or "it gives no reason", "free some space, or move that folder away", False

@@ -117,11 +117,11 @@ class Database(ABC):
             self._users += 1
         try:
             yield
-        finally:
-            with self._guard:
-                self._users -= 1
-                if not self._users:
-                    self._close()
+        except BaseException:
+            with suppress(TrapsError):  # the error of the block is what a person must know
+                self._leave()
+            raise
+        self._leave()
 
     def submit(self, change: Change) -> Future[Any]:
         """Add a change to the next transaction; its future is done when that is committed. Within `writing`."""
@@ -186,6 +186,12 @@ class Database(ABC):
 
     def _study(self, connection: sa.Connection) -> int | None:
         return connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)).scalar()
+
+    def _leave(self) -> None:
+        with self._guard:
+            self._users -= 1
+            if not self._users:
+                self._close()
 
     def _close(self) -> None:
         self._queue.put(None)

@@ -238,7 +238,7 @@ class _Content:
 
     def values(self, evaluation: int) -> dict[str, Any]:
         asides = {name: self.asides.get(name) for name in ASIDES}
-        digest = digest_of(self.content, asides["reasoning"], asides["raw"])
+        digest = digest_of(self.row["key"], self.content, asides["reasoning"], asides["raw"])
         return {"evaluation": evaluation, "key": self.row["key"], "content": self.content, "digest": digest, **asides}
 
 
@@ -307,6 +307,6 @@ class Writer:
 
 def _is_whole(row: sa.Row[Any]) -> bool:
     try:
-        return digest_of(row.content, row.reasoning, row.raw) == row.digest
-    except TypeError:  # a flipped bit can make another kind of value of a column
+        return digest_of(row.key, row.content, row.reasoning, row.raw) == row.digest
+    except (TypeError, AttributeError):  # a flipped bit can make another kind of value of a column
         return False

@@ -94,10 +94,10 @@ def encoded(row: Mapping[str, Any]) -> bytes:
     return json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
 
 
-def digest_of(content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:
+def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:
     """Return the digest (16 bytes) that is stored with a row and held against it when it is read."""
-    digest = blake2b(content, digest_size=16)
-    for aside in (reasoning, raw):
+    digest = blake2b(key.encode(), digest_size=16)
+    for aside in (content, reasoning, raw):
         digest.update(b"\0" if aside is None else b"\1" + aside)
     return digest.digest()
 

@@ -100,7 +100,11 @@ def collect(
     `run_work`.
     """
     known = {entry.id: entry for entry in entries}
-    with sharing(workspace, known.values()) as sharers, spending(workspace, known.values()) as budget:
+    with (
+        workspace.ledger.writing(),
+        sharing(workspace, known.values()) as sharers,
+        spending(workspace, known.values()) as budget,
+    ):
         participants = Participants(known, make, workspace.study, sharers=sharers)
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
         yield from run_work(work, cells)
