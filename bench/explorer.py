@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from bench.quick import parse
 from traps_pipeline.benchmark.items import build_items
@@ -41,6 +40,7 @@ from traps_pipeline.scoring.contrasts import contrasts, regime_tests
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS
 from traps_pipeline.scoring.standings import leaderboard
+from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -200,9 +200,7 @@ def _write(workspace: Workspace, table: Table, partition: dict[str, Any], rows: 
     """A partition without the digest of its rows, which takes longer than everything else here and is not looked at."""
     path = workspace.tables.path(table, partition)
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(
-        pa.Table.from_pandas(rows, schema=table.arrow_schema(), preserve_index=False), path, compression="zstd"
-    )
+    write_sealed(path, pa.Table.from_pandas(rows, schema=table.arrow_schema(), preserve_index=False), {})
 
 
 def _score(workspace: Workspace, verdicts: pd.DataFrame) -> None:

@@ -28,7 +28,7 @@ scenarios: [domino_chain-0001, hidden_race-0001]
 """
 NEEDING = {  # an experiment that wants an extra, and the beginning of what is said
     "models: [pocket]\npanel: rules\njudged_by_rules: true": "a model on this machine needs torch and torchvision and",
-    "models: [gpt-5-mini]\npanel: paper": "asking models over the network needs litellm and mcp, which are not",
+    "models: [gpt-5-mini]\npanel: paper": "asking models over the network needs litellm and mcp and aiohttp, which",
 }
 
 

@@ -26,7 +26,7 @@ TABLES: tuple[Table[Any], ...] = (RESPONSES, VOTES, VERDICTS, LEADERBOARD)
 # Names that the client library knows: it hides the system prompt in the question of a Gemini that it does not know.
 SERVED = {"openai": "seer", "gemini": "gemini-3-flash-preview", "anthropic": "claude-opus-4-6"}
 # Of the call and not of what it said: when, how often, how long, and half the price.
-OF_THE_CALL = ("created_at", "attempts", "latency_s", "cost_usd")
+OF_THE_CALL = ("created_at", "attempts", "latency_s", "cost_usd", "client")
 
 
 def experiment(folder: Path, url: str) -> Path:

@@ -38,7 +38,7 @@ TRANSIENT = {
     "timeout_status": 0.01,
     "conflict": 0.01,
 }
-OUTCOMES = {"empty": "empty", "length": "truncated", "thinking_exhausted": "empty", "content_filter": "refused"}
+OUTCOMES = {"empty": "empty", "length": "truncated", "thinking_exhausted": "truncated", "content_filter": "refused"}
 ENDINGS = dict.fromkeys(("empty", "length", "content_filter", "thinking_exhausted", "invalid_json"), 0.01)
 
 

@@ -150,19 +150,18 @@ def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout)
 
 
 def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(own_study: Checkout) -> None:
-    path = own_study.root / "traps_pipeline" / "defs" / "scoring.py"
-    stages = path.read_text()
-    before, place, after = stages.partition('    needs={"verdicts": "some"},')
-    old = re.search(r'    code="(\d+)",\n$', before)  # of the stage metrics, which stands just above
-    assert place and old is not None
-    path.write_text(f'{before[: old.start()]}    code="99",\n{place}{after}')
+    tables = Workspace.open(own_study.workspace).tables
+    old = tables.state(METRICS, {"dataset": "chaotic"}).code
+    with (own_study.root / "traps_pipeline" / "scoring" / "metrics.py").open("a") as formulas:
+        formulas.write("\nCHANGED = True\n")
     status = own_study.traps("status", EXPERIMENT).out
-    assert f"its code has version 99 now, it was made by version {old[1]}" in status
+    version = re.search(rf"its code has version (\w+) now, it was made by version {old}\b", status)
+    assert version is not None and version[1] != old, status
     run = own_study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "metrics: 4 partitions to do" in run.out
-    assert Workspace.open(own_study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == "99"
+    assert Workspace.open(own_study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == version[1]
     assert "its code has version" not in own_study.traps("status", EXPERIMENT).out
 
 

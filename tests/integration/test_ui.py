@@ -218,7 +218,7 @@ def stale(study: Checkout) -> list[str]:
 def test_a_runs_page_follows_it_to_its_end_without_a_reload(study: Checkout, server: str, page: Page) -> None:
     page.goto(f"{server}/assets/leaderboard?view=overview")
     page.get_by_role("button", name="Materialize").first.click()
-    page.get_by_role("link", name="View", exact=False).first.click()  # of the notice that a run was launched
+    page.get_by_role("link", name="View", exact=True).first.click()  # of the notice that a run was launched
     expect(page).to_have_url(re.compile(r"/runs/"))
     for event in ("RUN_START", "STEP_START", "ASSET_MATERIALIZATION", "STEP_SUCCESS", "RUN_SUCCESS"):
         expect(page.get_by_text(event, exact=True).first).to_be_visible()

@@ -163,7 +163,7 @@ def test_what_a_wheel_brought_is_left_and_a_file_of_ones_own_is_written(
 def test_another_workspace_is_chosen_where_the_disk_is_small(tiny_disk: Path, tmp_path: Path) -> None:
     remedied(
         lambda: doctor._disk(tiny_disk),
-        "study.doctor._disk",
+        "orchestration.machine.check_disk",
         again=lambda: doctor._disk(tmp_path),
     )
 
