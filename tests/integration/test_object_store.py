@@ -111,11 +111,11 @@ def test_errors_name_the_host_the_study_and_the_remedy(
     monkeypatch.delenv(DATABASE)
     refused = one.traps("init", EXPERIMENT)
     assert refused.code == 1 and f"{DATABASE} is not set" in refused.err
-    refused = one.traps("init", EXPERIMENT, "--workspace", "s3://no-such-bucket/study")
-    assert refused.code == 1 and "See that the bucket exists" in refused.err
     made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
     assert made.code == 1, "the variable is not set"
     monkeypatch.setenv(DATABASE, postgres.address())
+    refused = one.traps("init", EXPERIMENT, "--workspace", "s3://no-such-bucket/study")
+    assert refused.code == 1 and "See that the bucket exists" in refused.err
     made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
     assert made.code == 0, made.err
     for command in (("ledger", "move", "--store", "s3://lab/other"), ("annotate", "--who", "jd")):

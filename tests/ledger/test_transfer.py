@@ -49,6 +49,19 @@ def test_a_ledger_goes_through_a_file_with_all_that_was_paid(asked: Ledger, plac
     assert [*other.read("m").settled] == ["a", "b", "d"]
 
 
+def test_a_copy_that_was_killed_before_its_end_is_made_again(asked: Ledger, place: Place) -> None:
+    def killed() -> None:
+        raise KeyboardInterrupt
+
+    other = place.open() if place.kind == "postgres" else local(Path(place.where[0]) / "other")
+    with pytest.raises(KeyboardInterrupt):
+        copy_ledger(asked.database, other.database, killed)
+    assert copy_ledger(asked.database, other.database) == 4
+    assert [*other.rows("m")] == [*asked.rows("m")] and other.totals() == asked.totals()
+    with pytest.raises(TrapsError, match="holds rows of this study already"):
+        copy_ledger(asked.database, other.database)
+
+
 def test_nothing_is_moved_into_a_study_that_has_answers_or_while_somebody_asks(asked: Ledger, tmp_path: Path) -> None:
     other = local(tmp_path / "other")
     write(other, answer("a", "right"))

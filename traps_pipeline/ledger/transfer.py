@@ -45,8 +45,10 @@ def import_ledger(file: Path, ledger: Database) -> int:
 def copy_ledger(source: Database, target: Database, settle: Callable[[], None] = lambda: None) -> int:
     """Copy rows and money as they are, all or none, while nobody writes to the source; the number of rows.
 
-    settle: called when all is there, before anybody else may write. Raises TrapsError, also where the target has rows.
+    settle: called when all is there, before anybody else may write. A copy that was killed before its end is made
+    again. Raises TrapsError, also where the target has other rows.
     """
+    mark = f"copied from {source.place}"
     with ExitStack() as opened:
         opened.enter_context(target.writing())
         for kind in KINDS:
@@ -58,20 +60,26 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
                         "the same command again"
                     )
                 opened.callback(lock.release)
-        count = target.submit(lambda batch: _copy(source, batch, target.place)).result()
+        count = target.submit(lambda batch: _copy(source, batch, target.place, mark)).result()
         target.sync()
         settle()
+        done = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
+        target.submit(lambda batch: batch.connection.execute(done)).result()
     return count
 
 
-def _copy(source: Database, batch: Batch, place: str) -> int:
+def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
     mine = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
-    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(mine)).limit(1)).first():
+    others = mine.where(EVALUATIONS.c.writer.is_distinct_from(mark))
+    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(others)).limit(1)).first():
         raise TrapsError(
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
             "one by one with `traps answers import`"
         )
-    # Those that were opened and got no row would be in the way of the source's.
+    # What a copy that was killed has left, and evaluations without a row, would be in the way.
+    batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(mine)))
+    for table in (TOTALS, SPENT, RELEASES, RESERVATIONS):
+        batch.connection.execute(sa.delete(table).where(table.c.study == batch.study))
     batch.connection.execute(sa.delete(EVALUATIONS).where(EVALUATIONS.c.study == batch.study))
     count = 0
     if not source.exists():
@@ -79,7 +87,7 @@ def _copy(source: Database, batch: Batch, place: str) -> int:
     with source.read() as connection:
         study = connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == source.study_name)).scalar()
         for evaluation in connection.execute(sa.select(EVALUATIONS).where(EVALUATIONS.c.study == study)).all():
-            values = {"study": batch.study, "kind": evaluation.kind, "name": evaluation.name}
+            values = {"study": batch.study, "kind": evaluation.kind, "name": evaluation.name, "writer": mark}
             insert = sa.insert(EVALUATIONS).values(**values).returning(EVALUATIONS.c.id)
             number = batch.connection.execute(insert).scalar_one()
             query = sa.select(ROWS).where(ROWS.c.evaluation == evaluation.id).order_by(ROWS.c.id)
