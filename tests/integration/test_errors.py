@@ -145,7 +145,7 @@ def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Chec
     ledger = study.workspace / "ledger"
     ledger.symlink_to(small_disk, target_is_directory=True)
     filler = small_disk / "filler"
-    filler.write_bytes(b"0" * 900_000)
+    filler.write_bytes(b"0" * 500_000)
     refused = study.score(EXPERIMENT)
     assert_refused(refused, "ledger.sqlite: cannot be read or written", "no space left", "run the same command again")
     kept = {row["key"] for row in study.ledger_rows("answers")}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import signal
 import subprocess
 import sys
@@ -41,8 +43,9 @@ def hosts(
     """Two checkouts of one study, whose clips and items each has made, and whose ledger lies in the database."""
     monkeypatch.setenv(VARIABLE, postgres.address())
     register(unasked, provider, entry("image-model", "images"))
-    with (unasked.workspace / "study.yaml").open("a") as study:
-        study.write(f"database: {VARIABLE}\n")
+    file = unasked.workspace / "study.yaml"
+    text = re.sub(r"(?m)^name: .*$", f"name: study-{secrets.token_hex(4)}", file.read_text())
+    file.write_text(f"{text}database: {VARIABLE}\n")
     copy_workspace(unasked.workspace, tmp_path / "other")
     return unasked, Checkout(unasked.root, tmp_path / "other")
 
