@@ -53,7 +53,7 @@ def test_a_copy_that_was_killed_before_its_end_is_made_again(asked: Ledger, plac
     def killed() -> None:
         raise KeyboardInterrupt
 
-    other = place.open() if place.kind == "postgres" else local(Path(place.where[0]) / "other")
+    other = place.open() if place.kind == "postgres" else local(Path(place.where[1]) / "other")
     with pytest.raises(KeyboardInterrupt):
         copy_ledger(asked.database, other.database, killed)
     assert copy_ledger(asked.database, other.database) == 4
