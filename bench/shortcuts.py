@@ -38,7 +38,7 @@ from traps_pipeline.scenes.certification.certify_record import state_at_cut
 from traps_pipeline.scenes.certification.evidence import Claim
 from traps_pipeline.scenes.draw.likeness import NEAR_BITS, perceptual_hash
 from traps_pipeline.scenes.observe import observe
-from traps_pipeline.scenes.picture.checks import control_frames
+from traps_pipeline.scenes.picture.checks import closing_frames
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
@@ -142,7 +142,7 @@ def read_whole(world: World, spec: SceneSpec, qpos: np.ndarray) -> str | None:
     """What the observer answers from the control's clip, as a model is shown it."""
     with world.closed_renderer() as renderer, TemporaryDirectory() as folder:
         clip = Path(folder) / "control.mp4"
-        encode(list(control_frames(renderer, qpos, world.open_frames)), clip, world.physics.fps)
+        encode(list(closing_frames(renderer, qpos, world.board)), clip, world.physics.fps)
         return observe(clip, spec.question)
 
 

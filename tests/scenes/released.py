@@ -18,7 +18,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Family, Physics
 from traps_pipeline.scenes.picture.camera import Camera, Panel
-from traps_pipeline.scenes.picture.checks import control_frames
+from traps_pipeline.scenes.picture.checks import closing_frames
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
@@ -58,16 +58,19 @@ class Released:
     @cached_property
     def control_frames(self) -> np.ndarray:
         """The control as it is sampled, (25, 360, 480, 3)."""
+        return self._closing(panel=False)
+
+    def _closing(self, *, panel: bool) -> np.ndarray:
         world = World.of_record(self.spec, self.qpos)
         with world.closed_renderer() as renderer:
-            return np.stack(list(control_frames(renderer, self.qpos[SAMPLED], -(-world.open_frames // SAMPLED.step))))
+            return np.stack(list(closing_frames(renderer, self.qpos[SAMPLED], world.board[SAMPLED], panel=panel)))
 
     @cached_property
     def void(self) -> np.ndarray:
         """The void as it is sampled, (n, 360, 480, 3)."""
         if self.panel is None:
             return self.control_frames[: -(-self.spec.void["cut_frame"] // 2)]
-        return self._behind(self.panel, self.qpos[SAMPLED])
+        return self._closing(panel=True)
 
     def void_behind(self, panel_rgb: tuple[float, float, float]) -> np.ndarray:
         """The void with its panel in another colour. Only the first frame is drawn: nothing passes before a panel, so

@@ -15,8 +15,9 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.stored_evidence import answerable_voids
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, pair_of
 from traps_pipeline.scenes.parts.vision import after_panel, before_hold, before_panel
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
-from traps_pipeline.scenes.picture.checks import control_frames
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Panel
+from traps_pipeline.scenes.picture.checks import closing_frames
+from traps_pipeline.scenes.picture.coming_board import LANDED, coming_board
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.video.policies import last_of_all, shown_at_end
@@ -60,15 +61,40 @@ def test_closing_times_differ() -> None:
 # --- what is seen -----------------------------------------------------------------------------------------------------
 
 
-def test_a_closed_occlusion_control_ends_in_the_frames_of_its_void() -> None:
+def test_a_board_comes_before_a_control_and_its_void_alike_and_both_end_in_the_same_frames() -> None:
     case = load(RACE)
     world, closes = World.of_record(case.spec, case.qpos), case.spec.closes_frame
     assert closes is not None
-    shown = case.qpos[[0, closes - 1, closes, 49]]
+    at = [0, closes - 1, closes, 49]
+    board = [world.board[i] for i in at]
+    assert board[0] is None and board[1] is not None and board[1][2] > 0.2 and board[2:] == [LANDED, LANDED]
     with world.closed_renderer() as renderer:
-        control = list(control_frames(renderer, shown, 2))
-        void = list(renderer.frames(shown, panel=True))
+        control = list(closing_frames(renderer, case.qpos[at], board))
+        void = list(closing_frames(renderer, case.qpos[at], board, panel=True))
+        still = list(renderer.frames(case.qpos[at], panel=True))
     assert [np.array_equal(a, b) for a, b in zip(control, void, strict=True)] == [False, False, True, True]
+    assert [np.array_equal(a, b) for a, b in zip(void, still, strict=True)] == [True, False, True, True]
+
+
+def test_a_board_falls_as_things_fall_from_above_the_picture() -> None:
+    # From y = -2 m, half a metre up, 90 degrees high: the back of the falling board, at -0.8 - 0.202 m, leaves the
+    # picture 0.998 m above the eye, that is after 1.498 m. It falls so far in 0.55 s.
+    camera = Camera((0.0, 0.0, 0.5), 2.0, 90.0, 0.0, 90.0, 1.0, (0.0, 0.0, 0.5))
+    panel = Panel((0.0, -0.9, 0.3), (0.2, 0.1, 0.3), 0.0)
+    board = coming_board(Closing(8, panel), camera, 10, 10)
+    landing = np.sqrt(2 * 9.81 * 1.5)
+    heights = [landing * t - 9.81 * t**2 / 2 for t in (0.1, 0.2, 0.3, 0.4, 0.5)]
+    assert board[:3] == [None] * 3 and board[8:] == [LANDED] * 2
+    assert [offset[2] for offset in board[3:8] if offset][::-1] == pytest.approx(heights, abs=1e-9)
+
+
+def test_before_a_camera_that_looks_down_a_board_slides_in_from_its_side_of_the_picture() -> None:
+    camera = Camera((0.0, 0.0, 0.0), 2.0, 90.0, -60.0, 45.0, 1.0, (0.0, 0.0, 0.0))
+    left, right = (coming_board(Closing(8, Panel((x, 0.0, 0.3), (0.2, 0.1, 0.3), 0.0)), camera, 9, 10) for x in (-1, 1))
+    for board, side in ((left, -1), (right, 1)):
+        ways = [offset for offset in board[:8] if offset is not None]
+        assert ways and all(side * x > 0 and (y, z) == pytest.approx((0, 0)) for x, y, z in ways)
+    assert coming_board(None, camera, 3, 10) == [None] * 3
 
 
 def altered(spec: SceneSpec, **changes: Any) -> SceneSpec:
@@ -165,3 +191,10 @@ def test_a_large_thing_that_comes_to_rest_in_several_steps_is_no_panel() -> None
     for at, frame in enumerate(frames[5:]):
         frame[50:250, : min(400, 20 * at)] = RED  # 4,000 new pixels in each frame
     assert len(before_panel(frames)) == 25
+
+
+def test_a_panel_that_is_seen_on_its_way_comes_when_it_is_first_seen() -> None:
+    frames = clip()
+    for at, top in ((20, -60), (21, 20), (22, 100), (23, 100), (24, 100)):  # 160 pixels high, in steps of 80
+        frames[at, max(0, top) : top + 160, 100:300] = NAVY
+    assert len(before_panel(frames)) == 19  # its shadow may come one frame before it does

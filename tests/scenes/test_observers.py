@@ -124,7 +124,7 @@ def test_every_released_question_belongs_to_its_own_family_alone() -> None:
 def test_an_ill_posed_question_belongs_to_no_family_or_asks_for_what_its_observer_does_not_find() -> None:
     asked_of = {id_: family_asking(spec.ill_posed_question) for id_, spec in load_released().items()}
     found = {id_: family for id_, family in asked_of.items() if family is not None}
-    assert len(found) <= 3  # one that offers no choices may be worded as a family words its own
+    assert len(found) <= 5  # one that offers no choices may be worded as a family words its own
     for id_, family in found.items():
         case = load(id_)
         assert family.observe is not None

@@ -114,21 +114,21 @@ def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.
     A void that is held closes when its control does: else the panel alone would tell the sides of a chaotic pair.
     """
     control = shot.control
-    qpos, until = control.qpos, control.open_frames
+    qpos = control.qpos
     first, end = shot.control_span
     shown = shot.shown(first, end - first, spec)
     with control.closed_renderer() as renderer:
         if shot.cut_frame is not None:
             before = shot.shown(0, shot.void_length or shot.cut_frame, spec)
-            void = checks.control_frames(
-                renderer, qpos[np.minimum(before, shot.cut_frame - 1)], int((before < until).sum())
-            )
-            return list(checks.control_frames(renderer, qpos[shown], int((shown < until).sum()))), list(void)
+            held = qpos[np.minimum(before, shot.cut_frame - 1)]
+            void = list(checks.closing_frames(renderer, held, [control.board[i] for i in before]))
+            return list(checks.closing_frames(renderer, qpos[shown], [control.board[i] for i in shown])), void
         if control.closing is None and renderer.visible_pixels(qpos[-1:], control.concealed, panel=True).any():
             raise Rejected("the panel does not hide the outcome")
-        hidden = list(renderer.frames(qpos[shown], panel=True))
-        drawn = int((shown < until).sum())
-        return [*renderer.frames(qpos[shown[:drawn]]), *hidden[drawn:]], hidden
+        board = [control.board[i] for i in shown]
+        drawn = int((shown < control.open_frames).sum())
+        hidden = list(checks.closing_frames(renderer, qpos[shown], board, panel=True))
+        return [*checks.closing_frames(renderer, qpos[shown[:drawn]], board[:drawn]), *hidden[drawn:]], hidden
 
 
 def render_decoy(shot: Shot, spec: MediaSpec) -> list[np.ndarray] | None:

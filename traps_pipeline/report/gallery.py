@@ -21,6 +21,7 @@ from traps_pipeline.video.encode import decode
 POSTER_WIDTH, POSTER_HEIGHT = 240, 180
 POSTERS = "gallery"  # folder beside the page
 SIDES = ("control", "void", "twin")
+BOARD_COMES_S = 0.6  # so long a board is seen on its way at most
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def gallery(specs: pd.DataFrame, videos: pd.DataFrame, title: str) -> tuple[byte
         scenario_id = spec["scenario_id"]
         if all((scenario_id, side) in clips for side in SIDES):
             for side in SIDES:
-                before = closes_frame(spec) if side == "control" else None
+                before = shown_until(spec) if side == "control" else None
                 posters.append(Poster(_poster(scenario_id, side), clips[scenario_id, side], before))
             sections[spec["family"]].append(_entry(spec, clips))
     return _render(title, dict(sorted(sections.items()))).encode(), posters
@@ -104,6 +105,12 @@ def closes_frame(spec: Mapping[str, Any]) -> int | None:
     """The frame from which a panel closes the control of a SCENE_SPECS row; None if none does."""
     control = json.loads(spec["control"])
     return None if control is None else control["closes_frame"]
+
+
+def shown_until(spec: Mapping[str, Any]) -> int | None:
+    """The frame of the control of a SCENE_SPECS row before the board comes into the picture that closes it."""
+    frame, fps = closes_frame(spec), json.loads(spec["physics"])["fps"]
+    return None if frame is None else frame - round(BOARD_COMES_S * fps)
 
 
 def answer_of_control(spec: Mapping[str, Any]) -> str:

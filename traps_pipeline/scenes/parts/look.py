@@ -7,7 +7,7 @@ certificates are computed under it like everything else.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -149,14 +149,15 @@ def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
     return WIDTH * fine, HEIGHT * fine
 
 
-def paint_panel(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, params: Any) -> None:
-    """Give the cover panel its colour and its material. What it is of is seen on it alone: it neither mirrors nor lets
-    anything through."""
+def paint_panels(spec: mujoco.MjSpec, panels: Sequence[mujoco.MjsGeom], params: Any) -> None:
+    """Give panels of one size their colour and their material. What they are of is seen on them alone: they neither
+    mirror nor let anything through."""
     import mujoco
 
     look = look_of(params)
     colour = PANELS["navy" if look is None or look.panel is None else look.panel]
-    geom.rgba = [*colour, 1.0]
+    for geom in panels:
+        geom.rgba = [*colour, 1.0]
     if look is None or look.material == "plain":
         return
     down, right = np.mgrid[:TEXELS, :TEXELS] / TEXELS
@@ -169,10 +170,11 @@ def paint_panel(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, params: Any) -> None:
     material = spec.add_material(name="panel", specular=0.0, shininess=0.0, reflectance=0.0, rgba=[1, 1, 1, 1])
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "panel"
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
-    geom.material, geom.rgba = "panel", [1, 1, 1, 1]
-    wide, thick, tall = (float(half) for half in geom.size)  # a texture lies in a box's own x and y: stand it upright
-    cos, _, _, sin = (float(part) for part in geom.quat)
-    geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
+    for geom in panels:
+        geom.material, geom.rgba = "panel", [1, 1, 1, 1]
+        wide, thick, tall = (float(half) for half in geom.size)  # a texture lies in a box's own x and y: stand it up
+        cos, _, _, sin = (float(part) for part in geom.quat)
+        geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
 
 
 def dressed(scene: Scene, look: Look | None) -> Scene:

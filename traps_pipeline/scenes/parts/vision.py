@@ -16,6 +16,9 @@ from traps_pipeline.scenes.parts.look import PANELS
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
 PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
+STEP_PX = 4000  # of it that come in one step
+COMING_PX = 600  # of a panel on its way, that are new in a frame
+COMES_FRAMES = 4  # of five a second, in which it may be seen on its way
 EDGE = 60  # least contrast of an edge
 MOVED_PX = 24  # what moves changes more pixels from frame to frame
 CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
@@ -123,13 +126,13 @@ def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int 
 def before_panel(frames: np.ndarray) -> np.ndarray:
     """The frames before a panel comes that stands to the end of the clip; all of them if none comes.
 
-    A panel comes in one step: a large region turns to one colour (but for its shadow), which is not that of what is
-    around it, and stays as it is. What stands from the first frame on does not come; where a panel goes, the scene goes
-    on.
+    A panel comes in large steps: a large region turns to one colour (but for its shadow), which is not that of what is
+    around it, and soon a large region has that colour and keeps it. What stands from the first frame on does not come;
+    where a panel goes, the scene goes on.
     """
     for at in range(1, len(frames)):
         changed = _apart(frames[at], frames[at - 1]) > CHANGED
-        if changed.sum() < PANEL_PX:
+        if changed.sum() < STEP_PX:
             continue
         count, names = cv2.connectedComponents(changed.astype(np.uint8), connectivity=4)
         sizes = np.bincount(names.ravel(), minlength=count)
@@ -139,11 +142,33 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
         before, colour = (np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at]))
         even, beside = ((_apart(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
         was_even = (_apart(frames[at - 1][region], before) <= ALIKE).mean()
-        stays = (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean()
-        stands_out = beside < 0.3 or (beside < 0.75 and was_even < even)  # some of what is around it may be as dark
-        if sizes.max() >= PANEL_PX and even > 0.6 and stands_out and stays > 0.9:
-            return frames[:at]
+        stands_out = beside < 0.4 or (beside < 0.75 and was_even < even)  # some of what is around it may be as dark
+        if sizes.max() >= STEP_PX and even > 0.5 and stands_out and _stands_later(frames, at, colour):
+            return frames[: _sets_off(frames, at, colour)]
     return frames
+
+
+def _stands_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
+    """Whether a large region that had another colour before frame `comes` has this one soon and at the end."""
+    soon, end = frames[min(comes + COMES_FRAMES, len(frames) - 1)], frames[-1]
+    before, there, stays = (_apart(frame, colour) <= ALIKE for frame in (frames[comes - 1], soon, end))
+    stands = stays & ~before
+    return bool(stands.sum() >= PANEL_PX and (there & stands).sum() > 0.9 * stands.sum())
+
+
+def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
+    """The first frame in which a panel of a colour is seen on its way, or its shadow, a large part of which comes in
+    frame `comes`; that one if the panel stands in it already."""
+    now, end = (_apart(frame, colour) <= ALIKE for frame in (frames[comes], frames[-1]))
+    if (now & end).sum() > 0.9 * end.sum():
+        return comes
+    first = comes
+    while first > max(1, comes - COMES_FRAMES):
+        now, before = (_apart(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
+        if (now & ~before).sum() < COMING_PX:
+            break
+        first -= 1
+    return max(1, first - 1)
 
 
 def after_panel(frames: np.ndarray) -> np.ndarray:

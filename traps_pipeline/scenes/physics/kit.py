@@ -40,6 +40,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
 
 READ = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
 PANEL_GROUP = 4  # geoms of the cover panel: drawn in the void only, collide with nothing
+COMING_GROUP = 2  # the board that comes before a scene, until it stands
 FLOOR_GROUP = 3  # planes, while they are drawn
 REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Panel
+from traps_pipeline.scenes.picture.coming_board import LANDED, Coming
 from traps_pipeline.scenes.picture.render import Renderer
 
 SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
@@ -77,10 +78,14 @@ def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = (
     yield from renderer.frames(qpos, panel=True, without=without)
 
 
-def control_frames(renderer: Renderer, qpos: np.ndarray, open_frames: int) -> Iterator[np.ndarray]:
-    """The control that a trajectory makes: so many frames as they are, and the others behind the renderer's panel."""
-    yield from renderer.frames(qpos[:open_frames])
-    yield from renderer.frames(qpos[open_frames:], panel=True)
+def closing_frames(renderer: Renderer, qpos: np.ndarray, board: Coming, *, panel: bool = False) -> Iterator[np.ndarray]:
+    """Draw what a trajectory (F, nq) makes of a control, or of a void, whose panel stands from the start.
+
+    board: of each row, where the board is that closes it; once it stands it is drawn in the place of the void's own.
+    """
+    for row, offset in zip(qpos, board, strict=True):
+        stands = offset == LANDED
+        yield from renderer.frames([row], panel=panel or stands, board=None if stands else offset)
 
 
 def ablation_pixels(

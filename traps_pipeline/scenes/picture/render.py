@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.scenes.physics.flexes import flexes
-from traps_pipeline.scenes.physics.kit import FLOOR_GROUP, PANEL_GROUP, REMOVED_GROUP
+from traps_pipeline.scenes.physics.kit import COMING_GROUP, FLOOR_GROUP, PANEL_GROUP, REMOVED_GROUP
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera
+from traps_pipeline.scenes.picture.coming_board import Offset
 
 if TYPE_CHECKING:
     import mujoco
@@ -88,14 +89,16 @@ def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
 
 class Renderer:
     """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB, or
-    (720, 960, 3) of a model whose look is as fine as that."""
+    (720, 960, 3) of a model whose look is as fine as that. supersample: by how much the drawing is larger; 1 takes a
+    quarter of the time, where edges need not be smooth."""
 
-    def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
+    def __init__(self, model: mujoco.MjModel, camera: Camera, *, supersample: int = SUPERSAMPLE) -> None:
         global _renderer_open
         if _renderer_open:
             raise RuntimeError("a Renderer is open in this process; close it before the next one")
         self._fine = max(1, model.vis.global_.offheight // (HEIGHT * SUPERSAMPLE))  # where a look says so
-        self._width, self._height = (side * SUPERSAMPLE * self._fine for side in (WIDTH, HEIGHT))
+        self._scale = supersample * self._fine
+        self._width, self._height = (side * self._scale for side in (WIDTH, HEIGHT))
         _make_current(self._width, self._height)
         import mujoco
 
@@ -107,6 +110,8 @@ class Renderer:
         self._pixels = np.empty((self._height, self._width, 4), np.uint8)
         self._drawn: tuple[object, ...] | None = None  # what the picture in `_pixels` is of
         self._model, self._data, self._soft = model, mujoco.MjData(model), flexes(model)
+        self._comes, self._boards = False, np.flatnonzero(model.geom_group == COMING_GROUP)
+        self._board_places = model.geom_pos[self._boards].copy()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=2000)
@@ -126,15 +131,23 @@ class Renderer:
     def __exit__(self, *_: object) -> None:
         global _renderer_open
         _renderer_open = False
+        self._put_board(None)
         self._context.free()
 
     def frames(
-        self, qpos: Sequence[np.ndarray] | np.ndarray, *, panel: bool = False, without: Sequence[str] = ()
+        self,
+        qpos: Sequence[np.ndarray] | np.ndarray,
+        *,
+        panel: bool = False,
+        without: Sequence[str] = (),
+        board: Offset | None = None,
     ) -> Iterator[np.ndarray]:
-        """RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation)."""
+        """RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation). board: how
+        far from its place (m) a board is that comes before the scene; None if none does."""
         import cv2
 
         for row in qpos:
+            self._put_board(board)
             raw = self._draw(row, panel=panel, without=without)
             small = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
             yield cv2.flip(cv2.cvtColor(small, cv2.COLOR_RGBA2RGB), 0)
@@ -152,32 +165,39 @@ class Renderer:
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         try:
+            self._put_board(None)
             for i, row in enumerate(qpos):
                 rgba = self._draw(row, panel=panel, without=())
                 pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
                 shapes = self._scene.geoms[: self._scene.ngeom]
                 drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
                 seen = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
-                counts[i] = [seen.get(thing, 0) / (SUPERSAMPLE * self._fine) ** 2 for thing in things]
+                counts[i] = [seen.get(thing, 0) / self._scale**2 for thing in things]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return counts
 
+    def _put_board(self, offset: Offset | None) -> None:
+        """Put the board that comes so far from its place, where it is kept; None: there is none."""
+        self._comes = offset is not None
+        if self._boards.size:
+            self._model.geom_pos[self._boards] = self._board_places + np.array(offset or (0.0, 0.0, 0.0))
+
     def _draw(self, qpos: np.ndarray, *, panel: bool, without: Sequence[str]) -> np.ndarray:
         """The picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn again
         while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves is
-        taken away. (The model does not change while it is drawn.)"""
+        taken away. (The model does not change while it is drawn, but for the board that comes.)"""
         import mujoco
 
         self._data.qpos[:] = qpos
         self._place()
-        wanted = (*self._places(panel, without), panel, tuple(without), self._scene.flags.tobytes())
+        wanted = (*self._places(panel, without), panel, self._comes, tuple(without), self._scene.flags.tobytes())
         if wanted == self._drawn:
             return self._pixels
         self._drawn = None
         option = mujoco.MjvOption()
         option.geomgroup[:] = 1
-        option.geomgroup[PANEL_GROUP] = int(panel)
+        option.geomgroup[PANEL_GROUP], option.geomgroup[COMING_GROUP] = int(panel), int(self._comes)
         option.geomgroup[FLOOR_GROUP] = option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
         everything, unmoved = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvPerturb()
         groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
@@ -224,7 +244,9 @@ class Renderer:
         the whole pose stands for them."""
         model, data = self._model, self._data
         gone = [self._number(name) for name in without if not self._is_soft(name)]
-        shown = (model.geom_group != REMOVED_GROUP) & ((model.geom_group != PANEL_GROUP) | panel)
+        groups = model.geom_group
+        shown = (groups != REMOVED_GROUP) & ((groups != PANEL_GROUP) | panel)
+        shown &= (groups != COMING_GROUP) | self._comes
         shown[gone] = False
         places = (data.geom_xpos[shown], data.geom_xmat[shown], data.light_xpos, data.light_xdir)
         more = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)

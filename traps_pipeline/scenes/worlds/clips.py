@@ -1,7 +1,7 @@
 """The two clips of a scenario, replayed from its frozen trajectory: nothing is simulated here.
 
 Occluder: the void is the same replay with the cover panel drawn. Truncation: the void is a prefix of the control. A
-control that closes has a panel in its last frames; the twin's clip never has one.
+board comes before a control that closes, and before its void if an occluder makes it; the twin's clip never has one.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Family, Physics, Scene
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.picture.coming_board import LANDED, coming_board
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -133,11 +134,13 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
     panel, closing = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None, closing_of(spec)
     behind = panel if closing is None else closing.panel
     model, scene = compile_scene(family, family.params_from(spec.params), physics, behind)
+    camera = Camera.from_record(spec.camera)
     drawn, open_frames = 0, len(job.qpos) if closing is None else closing.frame
-    with Renderer(model, Camera.from_record(spec.camera)) as renderer:
+    board = coming_board(closing, camera, len(job.qpos), physics.fps)
+    with Renderer(model, camera) as renderer:
         control: list[np.ndarray] = []
         if job.control in missing or (panel is None and job.void in missing):
-            control = list(checks.control_frames(renderer, job.qpos, open_frames))
+            control = list(checks.closing_frames(renderer, job.qpos, board))
             drawn += len(control)
         if job.control in missing:
             save_clip(job.control, control, physics.fps)
@@ -145,8 +148,11 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
             decisive = decisive_geoms(model, scene.decisive)
             closed = control[open_frames:]  # behind the same panel: these are not drawn again
             open_to = len(job.qpos) - len(closed)
-            void = [*renderer.frames(job.qpos[:open_to], panel=True), *closed]
-            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job, void))
+            before = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], panel=True)
+            void = [*before, *closed]
+            still = [frame for frame, offset in enumerate(board) if offset in (None, LANDED)]
+            leaked = _leaked_pixels(renderer, scene, decisive, job, void, still)
+            drawn += save_clip(job.void, void, physics.fps, leaked)
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
         if job.twin in missing and spec.twin.params is None:
@@ -155,14 +161,20 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
 
 
 def _leaked_pixels(
-    renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job, void: Sequence[np.ndarray]
+    renderer: Renderer,
+    scene: Scene,
+    decisive: Sequence[str],
+    job: Job,
+    void: Sequence[np.ndarray],
+    still: Sequence[int],
 ) -> float:
     """What the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel hides
-    decisive bodies from hiding on, and the hidden element, without a trace."""
+    decisive bodies from hiding on, and the hidden element, without a trace. still: frames in which no board comes."""
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
     seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
-    ablated = np.unique(np.linspace(first, len(job.qpos) - 1, ABLATION_FRAMES).astype(int))
+    hiding = [frame for frame in still if frame >= first]
+    ablated = [hiding[i] for i in np.unique(np.linspace(0, len(hiding) - 1, ABLATION_FRAMES).astype(int))]
     whole = [void[frame] for frame in ablated]
     return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], whole)
 

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.look import paint_panel
+from traps_pipeline.scenes.parts.look import paint_panels
 from traps_pipeline.scenes.physics.flexes import flexes
-from traps_pipeline.scenes.physics.kit import PANEL_GROUP, Family, Motion, Physics, Scene, add_box
+from traps_pipeline.scenes.physics.kit import COMING_GROUP, PANEL_GROUP, Family, Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.physics.simulate import simulate
 from traps_pipeline.scenes.picture.camera import Panel
+from traps_pipeline.scenes.picture.coming_board import before_board
 
 if TYPE_CHECKING:
     import mujoco
@@ -62,15 +63,20 @@ def last_run(labels: Sequence[str | None]) -> int:
 def compile_scene(
     family: Family, params: Any, physics: Physics, panel: Panel | None = None
 ) -> tuple[mujoco.MjModel, Scene]:
-    """The compiled model of a scene, with the cover panel (own geom group, collides with nothing) if one is given."""
+    """The compiled model of a scene, with the cover panel if one is given, and another one like it, just in front, that
+    comes before the scene where a control closes; each has a geom group of its own and collides with nothing."""
     scene = family.build(params, physics)
     if panel is not None:
-        geom = add_box(scene.spec.worldbody, "cover_panel", panel.centre, panel.half, "navy")
-        half = np.radians(panel.yaw_deg) / 2
-        geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
-        paint_panel(scene.spec, geom, params)
-        geom.contype = geom.conaffinity = 0
-        geom.group = PANEL_GROUP
+        panels = []
+        for name, group, beside in (("cover_panel", PANEL_GROUP, 0), ("coming_panel", COMING_GROUP, 1)):
+            centre = np.array(panel.centre) + beside * before_board(panel)
+            geom = add_box(scene.spec.worldbody, name, centre.tolist(), panel.half, "navy")
+            half = np.radians(panel.yaw_deg) / 2
+            geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+            geom.contype = geom.conaffinity = 0
+            geom.group = group
+            panels.append(geom)
+        paint_panels(scene.spec, panels, params)
     return scene.spec.compile(), scene
 
 

@@ -15,6 +15,7 @@ from traps_pipeline.scenes.physics.kit import Family, Inventory, Motion, Physics
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture.camera import Camera, Closing, Panel
 from traps_pipeline.scenes.picture.checks import PastPanel, differing_pixels, void_frames
+from traps_pipeline.scenes.picture.coming_board import Coming, coming_board
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import (
     Outcome,
@@ -95,6 +96,11 @@ class World:
     def open_frames(self) -> int:
         """How many frames the control shows before a panel comes: all of them if none does."""
         return len(self.qpos) if self.closing is None else self.closing.frame
+
+    @cached_property
+    def board(self) -> Coming:
+        """Where the board is that closes the control, in every frame."""
+        return coming_board(self.closing, self.camera, len(self.qpos), self.physics.fps)
 
     @cached_property
     def motion(self) -> Motion:

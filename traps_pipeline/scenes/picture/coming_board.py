@@ -1,0 +1,65 @@
+"""How the board that closes a control comes: it falls from above the picture and stands where it lands.
+
+A camera that looks down on the scene sees it slide in from the side instead. It comes just in front of where a void's
+own board stands, in control and void alike: neither that a board comes nor when tells the sides of an occlusion pair
+apart.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Panel
+
+FASTER_M_S2 = 9.81  # as things fall; a board that slides in gains speed like one
+STEEP_DEG = 45.0  # a camera that looks down by more
+IN_FRONT_M = 0.002  # of the board that may stand already
+STEP_M = 0.02  # to which the way is found
+FURTHEST_M = 4.0
+
+Offset = tuple[float, float, float]
+LANDED: Offset = (0.0, 0.0, 0.0)
+Coming = list[Offset | None]  # of each frame: how far from its place (m) the board is; None while it is not there
+
+
+def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: float) -> Coming:
+    """Return where the board is in every frame of a control or void that it closes."""
+    if closing is None:
+        return [None] * n_frames
+    way = _way(closing.panel, camera)
+    distance = _out_of_picture_m(closing.panel, camera, way)
+    speed = math.sqrt(2 * FASTER_M_S2 * distance)  # m/s, as it lands
+
+    def offset(left_s: float) -> Offset | None:
+        if left_s >= speed / FASTER_M_S2:
+            return None
+        x, y, z = (speed * left_s - FASTER_M_S2 * left_s**2 / 2) * way
+        return (float(x), float(y), float(z))
+
+    return [LANDED if i >= closing.frame else offset((closing.frame - i) / fps) for i in range(n_frames)]
+
+
+def before_board(panel: Panel) -> np.ndarray:
+    """Return where a coming board is beside a standing one: just in front of it, towards the camera (m)."""
+    azimuth = math.radians(panel.yaw_deg + 90.0)
+    return -(2 * panel.half[1] + IN_FRONT_M) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+
+
+def _way(panel: Panel, camera: Camera) -> np.ndarray:
+    """Return the unit vector from a board's place towards where it comes from: up, or to its side of the picture."""
+    if camera.elevation_deg >= -STEEP_DEG:
+        return np.array([0.0, 0.0, 1.0])
+    right = camera.axes()[0]
+    return right if camera.project(np.array(panel.centre))[0, 0] >= WIDTH / 2 else -right
+
+
+def _out_of_picture_m(panel: Panel, camera: Camera, way: np.ndarray) -> float:
+    """Return how far along its way a board is wholly out of the picture."""
+    corners = panel.corners() + before_board(panel)
+    for distance in np.arange(0.0, FURTHEST_M, STEP_M):
+        x, y = camera.project(corners + distance * way).T
+        if (x < 0).all() or (x > WIDTH).all() or (y < 0).all() or (y > HEIGHT).all():
+            return float(distance)
+    return FURTHEST_M
