@@ -228,7 +228,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
             said += part
         time.sleep(0.1)
         requests = provider.stats()["requests"]
-        out, err = process.communicate(timeout=540)
+        _, err = process.communicate(timeout=540)
         assert (process.returncode, "Traceback" in err) == (130, False), err
         assert time.monotonic() - stopped < 20 and f"{stop.name}: stopping: waiting 30 s at most" in said.decode() + err
         assert provider.stats()["requests"] == requests

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 from traps_pipeline.base.terminal import plain
 
@@ -256,6 +256,7 @@ def clock(seconds: float) -> str:
     return f"{minutes}:{rest:02d}"
 
 
+AnyProgress = TypeVar("AnyProgress", bound=Progress)
 _current: list[Progress] = [Progress()]
 
 
@@ -265,7 +266,7 @@ def current() -> Progress:
 
 
 @contextmanager
-def reporting(progress: Progress) -> Iterator[Progress]:
+def reporting(progress: AnyProgress) -> Iterator[AnyProgress]:
     """Install a progress for the time of a block."""
     _current.append(progress)
     try:

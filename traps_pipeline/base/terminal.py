@@ -70,8 +70,8 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     with a rule below, and the last columns are left out and named where it is too narrow; elsewhere lines are plain,
     with two spaces or more between columns. No cell is wrapped or cut.
     """
-    from rich.cells import cell_len
     from rich.box import SIMPLE_HEAD
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

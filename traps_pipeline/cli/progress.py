@@ -26,11 +26,11 @@ _OF_CALLS = 58  # columns of the live table beside the name
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
     """Return the progress that a command installs. form: `auto` is a live region where the stream is a terminal."""
-    stream = stream or sys.stderr
+    out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
     if form == "json":
-        return JsonProgress(stream)
-    is_terminal = stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
-    return LiveProgress(stream) if form == "auto" and is_terminal else PrintedProgress(stream)
+        return JsonProgress(out)
+    is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    return LiveProgress(out) if form == "auto" and is_terminal else PrintedProgress(out)
 
 
 class PrintedProgress(Progress):
