@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.history import export
 from traps_pipeline.cluster.ray_runs import require_cluster
-from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.place import name_of
 from traps_pipeline.storage.workspace import Workspace
 

@@ -26,7 +26,6 @@ import pyarrow as pa
 from bench.quick import parse
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
@@ -34,16 +33,17 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import CATEGORIES, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.scenes.picture.encode import encode, frames_digest
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts, regime_tests
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS
 from traps_pipeline.scoring.standings import leaderboard
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import encode, frames_digest
 
 JUDGES = ("judge-a", "judge-b", "judge-c")
 RESAMPLES = 200  # of the leaderboard's intervals: how exact they are changes nothing here

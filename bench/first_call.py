@@ -44,7 +44,7 @@ def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
     asked has rows of other keys too."""
     from traps_pipeline.models.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
-    from traps_pipeline.orchestration.wanted import Wanted
+    from traps_pipeline.pipeline.wanted import Wanted
     from traps_pipeline.protocol.cells import Evaluation
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15

@@ -40,7 +40,7 @@ def multiply(workspace: Path, items: int) -> None:
     """Put so many items in the place of the dataset's own, with what they were made from."""
     import pandas as pd
 
-    from traps_pipeline.benchmark.tables import ITEMS
+    from traps_pipeline.storage.benchmark_tables import ITEMS
     from traps_pipeline.storage.workspace import Workspace
 
     tables, partition = Workspace.open(workspace).tables, {"dataset": "chaotic"}

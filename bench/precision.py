@@ -21,13 +21,13 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.reference import STRATEGIES
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Request
+from traps_pipeline.pipeline.experiment import LITE_FILE, load_experiment
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, datasets_of_category
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.power import Shares, precision
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.experiment import LITE_FILE, load_experiment
 
 RUNS, RESAMPLES = range(1, 10), 2000
 # What the parameters in the registry make of these: an answer is right on every control.

@@ -39,11 +39,11 @@ from traps_pipeline.scenes.certification.evidence import Claim
 from traps_pipeline.scenes.draw.likeness import NEAR_BITS, perceptual_hash
 from traps_pipeline.scenes.observe import observe
 from traps_pipeline.scenes.picture.checks import control_frames
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import encode
 
 STEP = 2  # every second frame is shown: 5 of 10 a second
 TURN_DEG = 10.0

@@ -33,8 +33,8 @@ def _clips(folder: Path) -> Iterator[Path]:
     from bench.render import _model, _qpos
     from traps_pipeline.benchmark.records import load_released
     from traps_pipeline.scenes.picture.camera import Camera
-    from traps_pipeline.scenes.picture.encode import encode
     from traps_pipeline.scenes.picture.render import Renderer
+    from traps_pipeline.video.encode import encode
 
     spec = load_released()["plinko-0001"]
     with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:

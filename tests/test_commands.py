@@ -15,7 +15,7 @@ import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.conftest import ROOT
 from traps_pipeline.cli import build_parser
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.pipeline.graph import the_graph
 
 README = ROOT / "README.md"
 PAGES = [README, *(ROOT / name for name in ("CONTRIBUTING.md", "SECURITY.md")), *sorted((ROOT / "docs").glob("*.md"))]

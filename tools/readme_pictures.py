@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.report.contact_sheet import contact_sheet
 from traps_pipeline.report.figures.looks import family_colour, family_of
 from traps_pipeline.report.writing import INK, SOFT, figure_bytes, figure_style, new_figure
-from traps_pipeline.scenes.picture.encode import decode
 from traps_pipeline.scoring.published import published_overall
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import decode
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCENARIO, SHOWN_S = "hidden_drop-0001", 3.1  # then a panel closes the control

@@ -2,13 +2,13 @@
 
 import dagster as dg
 
-import traps_pipeline.defs  # noqa: F401 - declares the graph
+import traps_pipeline.pipeline.stages  # noqa: F401 - declares the graph
 from traps_pipeline.base.paths import require_root
 from traps_pipeline.base.redaction import redact_tracebacks
-from traps_pipeline.orchestration.assets import WorkspaceResource, assets_of
-from traps_pipeline.orchestration.automation import jobs, sensors
-from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.schemes import study_here
+from traps_pipeline.pipeline.assets import WorkspaceResource, assets_of
+from traps_pipeline.pipeline.automation import jobs, sensors
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.schemes import study_here
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
 

@@ -13,7 +13,7 @@ from sqlalchemy.exc import OperationalError
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.explorer.labelstore import LabelStore
-from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell, Evaluation, SteeringCell
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,

@@ -13,9 +13,9 @@ from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_lines, read_yaml
+from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.experiment import load_experiment
 
 
 @pytest.fixture

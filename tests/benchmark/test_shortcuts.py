@@ -11,7 +11,7 @@ import pytest
 from traps_pipeline.benchmark.shortcuts import shortcuts
 from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
 from traps_pipeline.report.writing import figure_bytes
-from traps_pipeline.scenes.picture.encode import encode
+from traps_pipeline.video.encode import encode
 
 SCENARIOS = 10
 

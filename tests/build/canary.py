@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 from typing import Any
 
-from traps_pipeline.study.canary import CanaryRow
+from traps_pipeline.checks.canary import CanaryRow
 
 
 def asked(epoch: str, item: str, day: int, **said: Any) -> CanaryRow:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.storage.benchmark_tables import ITEMS
 
 HOSTILE = '<script>alert(1)</script> \\textbf{bold} $x$ <img src="http://evil.example/x.png"> & "quoted"'
 CELL = Cell("chaotic", Evaluation("oracle", "standard", 1))

@@ -11,9 +11,9 @@ import pytest
 
 from tests.conftest import KEY
 from tests.providers.server import Provider
+from traps_pipeline.checks.live_check import Live, check_live
 from traps_pipeline.models import api, registry
 from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
-from traps_pipeline.study.live_check import Live, check_live
 
 NAME = "seer"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec
+from traps_pipeline.video.encode import encode
 
 VIDEO = MediaSpec(profile="video", fps=5)
 

@@ -8,13 +8,13 @@ from typing import Any
 import pandas as pd
 
 from tests.build.cells import row
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.protocol.datasets import ANSWERABLE_ARMS, ARMS, VOID_ARMS
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 Rows = Callable[..., pd.DataFrame]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from traps_pipeline.benchmark.tables import VideoRow
+from traps_pipeline.storage.benchmark_tables import VideoRow
 
 PARTITION = {"category": "plinko"}
 

@@ -15,17 +15,17 @@ from tools.pocket.recipe import load_recipe
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.corrections import fold, read_corrections
 from traps_pipeline.benchmark.records import load_release, load_released
+from traps_pipeline.exchange.answer_exchange import checked_answers
 from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.judging.robustness import load_attacks
-from traps_pipeline.judging.validation import LABEL_COLUMNS, read_labels
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.models.request import Request
+from traps_pipeline.people.judge_validation import LABEL_COLUMNS, read_labels
+from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.exchange import checked_answers
-from traps_pipeline.study.experiment import load_experiment
 
 ASSETS, SPECS = ROOT / "assets", ROOT / "scene_specs"
 

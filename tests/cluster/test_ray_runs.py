@@ -22,7 +22,6 @@ from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Progress, Tally, reporting
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import CLIPS
 from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml, export
 from traps_pipeline.cluster.node import REFUSED_TAG
@@ -30,14 +29,15 @@ from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
 from traps_pipeline.cluster.requests import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.cluster.same_code import code_here, installed, require_same_code
-from traps_pipeline.defs import benchmark
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.run import dagster_history
-from traps_pipeline.orchestration.runs import broke_off, range_tags
-from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
-from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
-from traps_pipeline.orchestration.translation import asset_key
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.pipeline.runs import broke_off, range_tags
+from traps_pipeline.pipeline.schemes import CATEGORY, DATASET
+from traps_pipeline.pipeline.stages import benchmark_stages
+from traps_pipeline.pipeline.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
+from traps_pipeline.pipeline.translation import asset_key
+from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -72,10 +72,10 @@ def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
         return json.loads(tags[RESOURCES_TAG])
 
     one = {"num_cpus": 1, "runtime_env": {"env_vars": works | {"TRAPS_CORES": "1"}}}
-    assert taken(benchmark.VIDEOS.name) == {
+    assert taken(benchmark_stages.VIDEOS.name) == {
         "num_cpus": 4, "memory": int(2.2 * 2**30), "runtime_env": {"env_vars": works}
     }  # fmt: skip
-    assert taken(benchmark.ITEMS.name, gpus=1.0) == one
+    assert taken(benchmark_stages.ITEMS.name, gpus=1.0) == one
     reference, local = "occlusion|oracle__standard__run1", "occlusion|pocket__standard__run1"
     assert taken(RESPONSES.name, [reference], gpus=1.0) == one
     assert taken(RESPONSES.name, [reference, local], gpus=1.0) == one | {"num_gpus": 1.0}
@@ -239,7 +239,7 @@ def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command
         return json.loads(tags[RESOURCES_TAG])
 
     rendering, asking = (
-        takes(benchmark.VIDEOS.name, "dominoes"),
+        takes(benchmark_stages.VIDEOS.name, "dominoes"),
         takes(RESPONSES.name, "chaotic|pocket__standard__run1"),
     )
     assert (rendering["num_cpus"], rendering.get("num_gpus")) == (4, None) and rendering["memory"]

@@ -158,7 +158,7 @@ def test_the_command_shows_and_removes_what_is_old_enough(
     store.bucket.put(object_name(digest(LOST)), LOST)
     remedied(
         lambda: command("doctor", "--unused", "--workspace", folder),
-        "study.doctor.examine_unused",
+        "checks.doctor.examine_unused",
         again=lambda: command("doctor", "--unused", "--workspace", address),
     )
     assert "would be removed by `traps doctor --unused remove`" in capsys.readouterr().out

@@ -11,7 +11,7 @@ import pytest
 from tests.foreign_page import CHROMIUM, QUIET
 from traps_pipeline.base.terminal import visible
 from traps_pipeline.explorer.server import WEB, templates
-from traps_pipeline.orchestration.metadata import visible_metadata
+from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.report.writing import environment
 
 # Overrides, isolates and marks of direction; ESC, BEL, a C1 control, a lone carriage return; what belongs to a text.

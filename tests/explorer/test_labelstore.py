@@ -9,8 +9,8 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore, NotWaiting
-from traps_pipeline.judging.human_label_rows import LABELS_FILE
-from traps_pipeline.judging.labels import label_lines
+from traps_pipeline.people.human_label_rows import LABELS_FILE
+from traps_pipeline.people.labels import label_lines
 
 YES = {"abstained": True}
 

@@ -18,13 +18,13 @@ from playwright.sync_api import Page
 from tests.conftest import EXPERIMENT, Checkout
 from tests.integration.listening import Server, a_browser, listening, ready, watched
 from tests.pages import until
-from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS
-from traps_pipeline.judging.label_units import TaskName, units
+from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS
+from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
+from traps_pipeline.people.label_units import TaskName, units
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.tables.human_tables import said_by_people
-from traps_pipeline.scoring.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Checkout
-from traps_pipeline.benchmark.tables import ARMS, ITEMS
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
 from traps_pipeline.scoring.score_rows import HYPOTHESES, LEADERBOARD, ROBUST
+from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

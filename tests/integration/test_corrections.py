@@ -13,10 +13,10 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -38,9 +38,9 @@ import dagster as dg
 from dagster._core.definitions.data_version import CachingStaleStatusResolver
 from dagster._core.loader import LoadingContextForTest
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.history import History
-from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.history import History
+from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 graph = defs.get_repository_def().asset_graph
 with dg.DagsterInstance.get() as instance:

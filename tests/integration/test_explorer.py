@@ -21,7 +21,6 @@ from tests.build.cells import row, write_cell
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
 from tests.pages import patient, until
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
@@ -29,6 +28,7 @@ from traps_pipeline.report.leaderboard_page import leaderboards
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.writing import fraction, percent
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

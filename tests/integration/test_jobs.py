@@ -11,9 +11,9 @@ import dagster as dg
 import pytest
 
 from tests.conftest import ROOT, Checkout
-from traps_pipeline.orchestration.graph import JOB_GROUPS
-from traps_pipeline.orchestration.run import dagster_history
-from traps_pipeline.orchestration.runs import PARENT_TAG, ROOT_TAG
+from traps_pipeline.pipeline.graph import JOB_GROUPS
+from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.pipeline.runs import PARENT_TAG, ROOT_TAG
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

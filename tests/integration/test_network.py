@@ -294,7 +294,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
 )
 def test_a_line_that_is_no_answer_is_named(tmp_path: Path, line: str, complaint: str) -> None:
     from traps_pipeline.base.errors import TrapsError
-    from traps_pipeline.study.exchange import checked_answers
+    from traps_pipeline.exchange.answer_exchange import checked_answers
 
     given = tmp_path / "answers.jsonl"
     given.write_text(line + "\n")

@@ -15,8 +15,8 @@ import pytest
 from dagster import AssetKey, DagsterInstance
 
 from tests.conftest import Checkout, make_checkout
-from traps_pipeline.benchmark.tables import VIDEOS
-from traps_pipeline.orchestration.step import TAKEN
+from traps_pipeline.pipeline.step import TAKEN
+from traps_pipeline.storage.benchmark_tables import VIDEOS
 
 pytestmark = pytest.mark.slow
 SCENARIOS = 5

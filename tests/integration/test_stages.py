@@ -13,12 +13,12 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers, forget_rows
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging import panel
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -28,9 +28,9 @@ RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|oracle__json__ru
 VERSIONS = """
 import json
 import traps_pipeline.definitions
-from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.wanted import Wanted
 w = Workspace.open()
 found, stages = Lineage(w), Lineage(w).graph.stages
 print(json.dumps({
@@ -202,7 +202,7 @@ def test_a_run_that_lives_elsewhere_is_left_alone(study: Checkout) -> None:
     code = """
 import dagster as dg, os
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, this_host
+from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, this_host
 job = defs.resolve_job_def("report")
 with dg.DagsterInstance.get() as history:
     for host in ("another machine", this_host()):

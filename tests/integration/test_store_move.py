@@ -15,8 +15,8 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.storage.store_move import LEFT, move_to_store
 from traps_pipeline.storage.workspace import DATABASE, Workspace
-from traps_pipeline.study.store_move import LEFT, move_to_store
 
 pytestmark = pytest.mark.slow
 EXPERIMENT, ADDRESS = SMALL.with_name("one_regime.yaml"), "s3://lab/moved"
@@ -59,6 +59,6 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     named.write_text(re.sub(r"(?m)^name: .*$", "name: another", named.read_text()))
     remedied(
         lambda: move_to_store(Workspace.open(other.workspace), ADDRESS),
-        "study.store_move.move_to_store",
+        "storage.store_move.move_to_store",
         again=lambda: move_to_store(Workspace.open(other.workspace), "s3://lab/moved-too"),
     )

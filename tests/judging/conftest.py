@@ -13,7 +13,6 @@ import pytest
 
 from tests.conftest import KEY
 from tests.providers.server import Provider
-from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models import api, participants
 from traps_pipeline.models.answers import answer_request, response_row
@@ -24,6 +23,7 @@ from traps_pipeline.models.request import Outcome
 from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import is_ill_posed, taxonomy_of
+from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -35,13 +35,13 @@ from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, Verdict
 from traps_pipeline.judging.panel import parse_judgement
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
+from traps_pipeline.pipeline.experiment import load_experiment
+from traps_pipeline.pipeline.forecast_plan import Plan, make_plan
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.prevalence import prevalence
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.experiment import load_experiment
-from traps_pipeline.study.plan import Plan, make_plan
 
 THINKS, SPEAKS = "gemini-2.5-flash", "gemini-2.5-flash-nt"  # trace and output, output alone
 JUDGE = "labeller"

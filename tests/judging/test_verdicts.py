@@ -15,7 +15,6 @@ from tests.build.errors import raises
 from tests.judging.conftest import answered_study, vote_rows
 from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging import panel as judging
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.panel import collect_votes
@@ -23,6 +22,7 @@ from traps_pipeline.judging.verdicts import decide, decide_cell
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = Cell("occlusion", Evaluation("oracle", "standard", 1))

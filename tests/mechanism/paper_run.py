@@ -16,7 +16,7 @@ import yaml
 
 from traps_pipeline.models.local.tiny import Family, build_tiny
 from traps_pipeline.models.prompts import PROMPTS
-from traps_pipeline.study.experiment import EXPERIMENTS
+from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
-from traps_pipeline.scenes.picture.encode import encode
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
 from traps_pipeline.storage.study import MechanismSettings, Study
 from traps_pipeline.storage.tables import Row, Table
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import encode
 
 CATEGORY = {"occlusion": "hidden", "chaotic": "plinko"}
 PAIRS = 4

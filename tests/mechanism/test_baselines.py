@@ -13,9 +13,9 @@ from traps_pipeline.mechanism.baselines import noise_floor, raw_features, scored
 from traps_pipeline.mechanism.margin import begins_abstention
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import ProbeSettings
+from traps_pipeline.video.encode import encode
 
 PAIRS = 12
 SETTINGS = ProbeSettings(folds=3, resamples=100)

@@ -32,9 +32,9 @@ from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 from traps_pipeline.storage.store import FolderStore
+from traps_pipeline.video.encode import encode
 
 pytestmark = pytest.mark.slow
 POCKET = "pocket"

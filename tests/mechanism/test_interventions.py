@@ -17,7 +17,6 @@ from tests.mechanism.study import make_study, register, tiny_entry
 from traps_pipeline import inside
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism import stages, steering
 from traps_pipeline.mechanism.deciding import conditions
 from traps_pipeline.mechanism.directions import steered_scenarios
@@ -32,6 +31,7 @@ from traps_pipeline.models.local.spans import spans
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import profile_digest, sample
 from traps_pipeline.storage.study import ACTING, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.control_rows import GateRow
@@ -33,6 +32,7 @@ from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prom
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -9,7 +9,6 @@ import pytest
 
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import VIDEOS, VideoRow
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.hidden_states import read_layer
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, HiddenStatesRow
@@ -17,6 +16,7 @@ from traps_pipeline.mechanism.probe_items import other_clip, probe_items
 from traps_pipeline.mechanism.probing_versions import extraction_version, states_folder
 from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.protocol.datasets import ANSWERABLE
+from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

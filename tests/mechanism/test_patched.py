@@ -14,7 +14,6 @@ import pytest
 from tests.local_models import SYSTEM, ask, clip, model
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism import patched
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.margin import abstention_tokens
@@ -28,9 +27,10 @@ from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
-from traps_pipeline.scenes.picture.encode import encode
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import encode
 
 pytestmark = pytest.mark.slow
 TINY = Extraction("tiny", "standard")

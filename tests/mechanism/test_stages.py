@@ -21,7 +21,6 @@ from tests.mechanism.steer_cell import CELL
 from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.baselines import baseline_rows
@@ -47,11 +46,12 @@ from traps_pipeline.mechanism.steering import (
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
-from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
+from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.tables import Table

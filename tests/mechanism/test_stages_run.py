@@ -68,13 +68,13 @@ import json
 import dagster as dg
 import pyarrow.parquet as pq
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.graph import Collect, Source, name_of, the_graph
-from traps_pipeline.orchestration.lineage import Lineage, _report_state
-from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.pipeline.graph import Collect, Source, name_of, the_graph
+from traps_pipeline.pipeline.lineage import Lineage, _report_state
+from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.parquet import write_sealed
-from traps_pipeline.orchestration.runs import RunsHere
+from traps_pipeline.pipeline.runs import RunsHere
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.wanted import Wanted
 
 workspace, graph = Workspace.open(), the_graph()
 job = defs.resolve_implicit_global_asset_job_def()

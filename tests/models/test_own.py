@@ -12,9 +12,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import own
 from traps_pipeline.models.judges import load_panel, panel_id, thinking_of
 from traps_pipeline.models.registry import account_of, get_model, load_models
+from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
-from traps_pipeline.study.experiment import load_experiment
 
 MINE = """\
 name: mine

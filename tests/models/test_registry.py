@@ -10,7 +10,7 @@ from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import get_model, load_models
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
 

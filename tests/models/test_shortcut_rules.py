@@ -21,10 +21,10 @@ from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, PANEL_PX, RUL
 from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, Look
 from traps_pipeline.scenes.parts.vision import largest_board
 from traps_pipeline.scenes.physics.kit import COLOURS
-from traps_pipeline.scenes.picture.encode import count_frames, encode
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene
 from traps_pipeline.scenes.worlds.world import World
+from traps_pipeline.video.encode import count_frames, encode
 
 FLOOR, NAVY = (200, 200, 188), tuple(round(255 * part) for part in COLOURS["navy"])
 CHOICES, OPEN = "Is the ball in the tray, yes or no?", "What did the ball cost?"

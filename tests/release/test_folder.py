@@ -17,14 +17,14 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
 from traps_pipeline.release.folder import Options, identifying, write_release
 from traps_pipeline.release.tables import OPEN
-from traps_pipeline.scenes.picture.encode import decode
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import decode
 
 pytestmark = pytest.mark.slow
 

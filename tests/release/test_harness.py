@@ -16,15 +16,15 @@ from tests.conftest import EXPERIMENT, Checkout, once
 from tests.release.environments import run_in
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
-from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.exchange.answer_exchange import Whose, import_answers
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
 from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.exchange import Whose, import_answers
-from traps_pipeline.study.experiment import load_experiment
 
 pytestmark = pytest.mark.slow
 MODELS = ("oracle", "always-abstain", "observer", "random-50")

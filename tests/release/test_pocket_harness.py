@@ -14,11 +14,11 @@ from tests.build.harness import ours
 from tests.conftest import ROOT, Checkout
 from tests.release.environments import python_of, run_in
 from tests.serving import transformers_serve
+from traps_pipeline.exchange.harness_logs import reader_of
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.harness.scoring import FIGURES
 from traps_pipeline.release.harness.write import shown, write_harness
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.harness_logs import reader_of
 
 pytestmark = pytest.mark.slow
 WEIGHTS = ROOT / "assets" / "pocket" / "weights"

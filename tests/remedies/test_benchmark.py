@@ -16,9 +16,9 @@ from tests.remedies.remedied import remedied
 from traps_pipeline.benchmark.corrections import Correction, check_benchmark, fold, read_corrections
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import RELEASED, load_released
-from traps_pipeline.scenes.picture.encode import DamagedClip, decode, encode
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.study import Study
+from traps_pipeline.video.encode import DamagedClip, decode, encode
 
 ID, OTHER = "domino_chain-0001", "plinko-0003"
 RECORDS = load_released()
@@ -168,7 +168,7 @@ def test_a_clip_that_holds_fewer_frames_than_it_promises_is_made_again(tmp_path:
     clip.write_bytes(data[:-last])
     decoded, _ = remedied(
         lambda: decode(clip),
-        "scenes.picture.encode.decode",
+        "video.encode.decode",
         made_again,
         error=DamagedClip,
     )

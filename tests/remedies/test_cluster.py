@@ -24,7 +24,7 @@ from traps_pipeline.cluster.bucket import Bucket
 from traps_pipeline.cluster.history import HISTORY, LOGS
 from traps_pipeline.cluster.ray_runs import require_cluster
 from traps_pipeline.cluster.same_code import code_here, require_same_code
-from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
@@ -211,7 +211,4 @@ def test_a_host_whose_password_is_wrong_opens_the_history_once_it_is_right(
         with dagster_history(workspace) as instance:
             return instance.get_runs_count()
 
-    assert (
-        remedied(runs, "orchestration.run.dagster_history", lambda: monkeypatch.setenv(DATABASE, postgres.address()))
-        == 0
-    )
+    assert remedied(runs, "pipeline.run.dagster_history", lambda: monkeypatch.setenv(DATABASE, postgres.address())) == 0

@@ -18,14 +18,15 @@ from tests.providers.server import Provider
 from tests.remedies.remedied import command, refused, remedied
 from traps_pipeline.base import paths
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.selection import stages_until
+from traps_pipeline.checks import doctor
+from traps_pipeline.exchange import harness_logs
+from traps_pipeline.exchange.answer_exchange import Whose, checked_answers, export_requests, import_answers
+from traps_pipeline.exchange.batch import FOLDER, export_batches
+from traps_pipeline.pipeline.experiment import load_experiment
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.selection import stages_until
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study import doctor, harness_logs
-from traps_pipeline.study.batch import FOLDER, export_batches
-from traps_pipeline.study.exchange import Whose, checked_answers, export_requests, import_answers
-from traps_pipeline.study.experiment import load_experiment
 
 __all__ = ["nobodys_own"]  # the fixture
 SMALL = ROOT / EXPERIMENT
@@ -45,12 +46,12 @@ def unasked_copy(small: Checkout, tmp_path: Path) -> Workspace:
 def test_stages_are_chosen_from_those_that_are_named() -> None:
     remedied(
         lambda: stages_until("leaderbord"),
-        "orchestration.selection.stages_until",
+        "pipeline.selection.stages_until",
         again=lambda: stages_until("leaderboard"),
     )
     remedied(
         lambda: the_graph()["leaderbord"],
-        "orchestration.graph.Graph.__getitem__",
+        "pipeline.graph.Graph.__getitem__",
         again=lambda: the_graph()["leaderboard"],
     )
 
@@ -89,7 +90,7 @@ def test_an_export_in_batches_is_of_models_with_a_provider(unasked_copy: Workspa
     for again in (export("here.yaml", "other"), export("mine.yaml", "third", "--batch")):
         remedied(
             export("here.yaml", "other", "--batch"),
-            "study.batch.export_batches",
+            "exchange.batch.export_batches",
             again=again,
         )
 
@@ -163,7 +164,7 @@ def test_what_a_wheel_brought_is_left_and_a_file_of_ones_own_is_written(
 def test_another_workspace_is_chosen_where_the_disk_is_small(tiny_disk: Path, tmp_path: Path) -> None:
     remedied(
         lambda: doctor._disk(tiny_disk),
-        "orchestration.machine.check_disk",
+        "base.files.check_disk",
         again=lambda: doctor._disk(tmp_path),
     )
 
@@ -179,24 +180,24 @@ def test_an_export_goes_to_another_folder_or_to_one_that_was_deleted(unasked_cop
     assert export_requests(unasked_copy, asks, out) > 0
     remedied(
         lambda: export_requests(unasked_copy, asks, out),
-        "study.exchange.export_requests",
+        "exchange.answer_exchange.export_requests",
         again=lambda: export_requests(unasked_copy, asks, other),
     )
     remedied(
         lambda: export_requests(unasked_copy, asks, out),
-        "study.exchange.export_requests",
+        "exchange.answer_exchange.export_requests",
         lambda: shutil.rmtree(out),
     )
     (out / FOLDER).mkdir(exist_ok=True)
     (out / FOLDER / "batch.jsonl").write_text("{}")
     remedied(
         lambda: export_batches({}, out),
-        "study.batch.export_batches",
+        "exchange.batch.export_batches",
         again=lambda: export_batches({}, tmp_path / "third"),
     )
     remedied(
         lambda: export_batches({}, out),
-        "study.batch.export_batches",
+        "exchange.batch.export_batches",
         lambda: shutil.rmtree(out / FOLDER),
     )
 
@@ -214,7 +215,7 @@ def test_answers_are_imported_once_it_is_said_whose_they_are_and_no_error_is_amo
     written(right)()
     found = remedied(
         lambda: import_answers(unasked_copy, asks, path),
-        "study.exchange._by_item",
+        "exchange.answer_exchange._by_item",
         again=lambda: import_answers(unasked_copy, asks, path, Whose("prior")),
     )
     assert found.new == 1
@@ -222,7 +223,7 @@ def test_answers_are_imported_once_it_is_said_whose_they_are_and_no_error_is_amo
     written(right, wrong)()
     found = remedied(
         lambda: import_answers(unasked_copy, asks, path, Whose("prior")),
-        "study.exchange._by_item",
+        "exchange.answer_exchange._by_item",
         written(right),
     )
     assert (found.new, found.known) == (0, 1)
@@ -230,7 +231,7 @@ def test_answers_are_imported_once_it_is_said_whose_they_are_and_no_error_is_amo
     given.write_text(json.dumps({"key": "k", "outcome": "error"}) + "\n")
     remedied(
         lambda: checked_answers(given, {}),
-        "study.exchange.checked_answers",
+        "exchange.answer_exchange.checked_answers",
         lambda: given.write_text(""),
     )
 
@@ -247,7 +248,7 @@ def test_a_log_without_images_or_converted_is_read(tmp_path: Path, monkeypatch: 
         logged(2000)()
         remedied(
             lambda: list(harness_logs._json_log(log)),
-            "study.harness_logs._json_log",
+            "exchange.harness_logs._json_log",
             logged(10),
         )
     zipped = tmp_path / "images.eval"
@@ -264,11 +265,11 @@ def test_a_log_without_images_or_converted_is_read(tmp_path: Path, monkeypatch: 
     with monkeypatch.context() as small_limits:
         small_limits.setattr(harness_logs, "MOST_SAMPLE_BYTES", 1000)
         packed(2000)()
-        remedied(lambda: list(harness_logs._eval_log(zipped)), "study.harness_logs._eval_log", packed(10))
+        remedied(lambda: list(harness_logs._eval_log(zipped)), "exchange.harness_logs._eval_log", packed(10))
     broken = tmp_path / "log.eval"
     broken.write_bytes(b"no zip")
     remedied(
         lambda: list(harness_logs._eval_log(broken)),
-        "study.harness_logs._eval_log",
+        "exchange.harness_logs._eval_log",
         again=lambda: list(harness_logs._json_log(log)),
     )

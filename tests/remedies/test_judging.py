@@ -13,17 +13,17 @@ from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
 from tests.judging.conftest import answered_study, judge_at
 from tests.providers.server import Provider
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
 from traps_pipeline.judging.judging_rows import CONFABULATION, VOTES
-from traps_pipeline.judging.labels import LABELS_FILE, label_lines
 from traps_pipeline.judging.panel import collect_votes, judged_answers, wanted_ballots
 from traps_pipeline.judging.robustness import check_panel, load_attacks
-from traps_pipeline.judging.validation import annotation_sheet, read_labels, write_sheet
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.people.judge_validation import annotation_sheet, read_labels, write_sheet
+from traps_pipeline.people.labels import LABELS_FILE, label_lines
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -112,17 +112,17 @@ def test_a_sheet_is_written_once_there_are_labels_of_these_answers(tmp_path: Pat
     (tmp_path / "labels.csv").write_text(f"{HEAD}\n")
     remedied(
         lambda: command("confabulation", "sheet", sheet, *at),
-        "judging.validation.sheet_rows",
+        "people.judge_validation.sheet_rows",
         lambda: workspace.tables.write(CONFABULATION, {}, labels, {}),
     )
     remedied(
         lambda: command("confabulation", "sheet", sheet, *at),
-        "judging.validation.write_sheet",
+        "people.judge_validation.write_sheet",
         again=lambda: command("confabulation", "sheet", tmp_path / "other.csv", *at),
     )
     remedied(
         lambda: write_sheet(annotation_sheet(workspace), sheet),
-        "judging.validation.write_sheet",
+        "people.judge_validation.write_sheet",
         sheet.unlink,
     )
     cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
@@ -130,7 +130,7 @@ def test_a_sheet_is_written_once_there_are_labels_of_these_answers(tmp_path: Pat
     workspace.tables.write(RESPONSES, cell.partition, answers.assign(text="Right."), {})
     remedied(
         lambda: annotation_sheet(workspace),
-        "judging.validation._sheet_row",
+        "people.judge_validation._sheet_row",
         lambda: labelled_study(root, ["Right."]),
     )
 
@@ -141,7 +141,7 @@ def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: 
         written(tmp_path, HEAD, *GOOD[:3], "bob,s2,1,0,2,1")
         remedied(
             lambda: read_labels(path, ["s1", "s2"]),
-            "judging.validation._refuse",
+            "people.judge_validation._refuse",
             lambda right=right: written(tmp_path, HEAD, *GOOD[:3], f"bob,s2,1,0,{right},1"),
         )
     workspace = labelled_study(tmp_path / "study", ["It goes left."])
@@ -151,7 +151,7 @@ def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: 
     workspace.tables.write(CONFABULATION, {}, [], {})
     remedied(
         lambda: command("confabulation", "validate", path, "--workspace", workspace.root),
-        "judging.validation.validate",
+        "people.judge_validation.validate",
         lambda: workspace.tables.write(CONFABULATION, {}, labels, {}),
     )
 
@@ -169,7 +169,7 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     path.write_bytes(path.read_bytes().replace(b'"u1"', b'"u9"', 1))
     lines = remedied(
         lambda: label_lines(tmp_path),
-        "judging.labels.label_lines",
+        "people.labels.label_lines",
         lambda: shutil.copy(kept, path),
     )
     assert [line.unit for line in lines] == ["u1", "u2"]

@@ -13,9 +13,9 @@ from safetensors.torch import load_file, save_file
 
 from tests.local_models import ask, checkpoint, entry, model
 from tests.remedies.remedied import remedied
+from traps_pipeline.checks.doctor import examine_local
 from traps_pipeline.mechanism.adapter_checks import CHECKS
 from traps_pipeline.models.local.adapter import load_local_model
-from traps_pipeline.study.doctor import examine_local
 
 pytestmark = pytest.mark.slow
 
@@ -143,7 +143,7 @@ def test_a_prompt_that_does_not_fit_is_answered_once_memory_is_freed(monkeypatch
 def test_a_model_that_runs_here_is_looked_into() -> None:
     findings = remedied(
         lambda: [*examine_local(["gpt-5-mini"])],
-        "study.doctor.examine_local",
+        "checks.doctor.examine_local",
         again=lambda: [*examine_local(["pocket"])],
     )
     assert all(finding.ok for finding in findings if finding.what.startswith("pocket, ")), findings

@@ -11,7 +11,7 @@ from tests.remedies.remedied import remedied
 from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import check_name
 from traps_pipeline.base.network import check_network
-from traps_pipeline.orchestration.selection import require_work
+from traps_pipeline.pipeline.selection import require_work
 from traps_pipeline.scenes.picture.trial import check_rendering
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
@@ -73,11 +73,11 @@ def test_an_experiment_asks_something_of_the_stage_that_is_named(tmp_path: Path)
 
     remedied(
         lambda: require_work(study("occlusion"), "mine", None),
-        "orchestration.selection.require_work",
+        "pipeline.selection.require_work",
         again=lambda: require_work(study("chaotic"), "mine", None),
     )
     remedied(
         lambda: require_work(study("chaotic"), "mine", "hidden_states"),
-        "orchestration.selection.require_work",
+        "pipeline.selection.require_work",
         again=lambda: require_work(study("chaotic"), "mine", "items"),
     )

@@ -20,7 +20,7 @@ from traps_pipeline.mechanism.patched import patching_rows
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import StatesCell
 from traps_pipeline.storage.study import Asked, MechanismSettings, PatchingSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -17,9 +17,9 @@ from traps_pipeline.models import prompts
 from traps_pipeline.models.local.settings import LocalParams
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import Account
+from traps_pipeline.pipeline.experiment import Experiment, load_experiment
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
-from traps_pipeline.study.experiment import Experiment, load_experiment
 
 __all__ = ["nobodys_own"]  # fixtures
 
@@ -108,7 +108,7 @@ def test_an_experiment_that_is_not_there_is_named_by_its_path_or_a_known_name(tm
     for known in ("demo", str(path)):
         remedied(
             lambda: load_experiment("mine"),
-            "study.experiment.load_experiment",
+            "pipeline.experiment.load_experiment",
             again=lambda known=known: load_experiment(known),
         )
 
@@ -121,18 +121,18 @@ def test_a_panel_is_named_in_one_place(tmp_path: Path) -> None:
     one = experiment(tmp_path, panel="paper")
     remedied(
         lambda: one.judged(None, "rules"),
-        "study.experiment.Experiment.judged",
+        "pipeline.experiment.Experiment.judged",
         again=lambda: experiment(tmp_path, panel="rules").judged(None, "rules"),
     )
     judged = Study(panel="rules")
     remedied(
         lambda: one.judged(judged, None),
-        "study.experiment.Experiment.judged",
+        "pipeline.experiment.Experiment.judged",
         again=lambda: one.judged(Study(panel="paper"), None),
     )
     remedied(
         lambda: one.check_study(judged, tmp_path),
-        "study.experiment.Experiment.check_study",
+        "pipeline.experiment.Experiment.check_study",
         again=lambda: one.check_study(Study(panel="paper"), tmp_path),
     )
     remedied(
@@ -160,7 +160,7 @@ def test_two_mechanism_sections_are_made_one(tmp_path: Path) -> None:
     for right in (paper.mechanism, None):
         remedied(
             lambda: paper.check_study(paper.study.model_copy(update={"mechanism": other}), tmp_path),
-            "study.experiment.Experiment.check_study",
+            "pipeline.experiment.Experiment.check_study",
             again=lambda right=right: paper.check_study(paper.study.model_copy(update={"mechanism": right}), tmp_path),
         )
 

@@ -12,13 +12,13 @@ from tests.build.canary import asked
 from tests.build.entries import nobodys_own
 from tests.conftest import Checkout
 from tests.remedies.remedied import refused, remedied
+from traps_pipeline.checks.canary import CANARY, changes_text
 from traps_pipeline.explorer import site
 from traps_pipeline.explorer.site import write_site
-from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.scoring.epochs import EpochMismatch, require_one_epoch
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.canary import CANARY, changes_text
 
 __all__ = ["nobodys_own"]  # the fixture
 
@@ -35,10 +35,10 @@ def test_a_history_is_opened_once_what_lies_in_its_way_is_moved(
         with dagster_history(workspace) as instance:
             return len(instance.get_runs())
 
-    refused(opened, "orchestration.run.dagster_history")
+    refused(opened, "pipeline.run.dagster_history")
     found = remedied(
         opened,
-        "orchestration.run.dagster_history",
+        "pipeline.run.dagster_history",
         lambda: home.rename(tmp_path / "away"),
     )
     assert found == 0

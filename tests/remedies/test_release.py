@@ -10,7 +10,6 @@ import pytest
 from tests.build.commitments import committed
 from tests.conftest import Checkout
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.release.checksums import CHECKSUMS, read_checksums
 from traps_pipeline.release.commitment import commit, read_commitment
 from traps_pipeline.release.content import content_of, pair_rows
@@ -20,6 +19,7 @@ from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.release.submission import pack, read_submission
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -14,15 +14,15 @@ from tests.build.video_rows import PARTITION, clip
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
-from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
 from traps_pipeline.ledger.transfer import export_ledger, import_ledger
-from traps_pipeline.scenes.picture.encode import DamagedClip, count_frames, decode, decode_first
 from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage import media
+from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.media import MediaStore, payload
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import place_of
+from traps_pipeline.video.encode import DamagedClip, count_frames, decode, decode_first
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_a_clip_that_is_made_again_is_decoded(tmp_path: Path, looks: Callable[[P
 
     remedied(
         lambda: looks(path),
-        "scenes.picture.encode",
+        "video.encode",
         made_again,
         error=DamagedClip,
     )

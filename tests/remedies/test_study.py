@@ -14,22 +14,22 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.remedies.remedied import refused
 from traps_pipeline.benchmark.items import build_items
-from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.defs import judging, report, scoring
+from traps_pipeline.checks.canary import canary_items
+from traps_pipeline.exchange import answer_exchange
+from traps_pipeline.exchange.answer_exchange import export_requests
 from traps_pipeline.explorer.annotate import Annotation
 from traps_pipeline.explorer.answers import study_items
 from traps_pipeline.explorer.review import Review
 from traps_pipeline.models.answers import wanted_questions
-from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.pipeline.experiment import Experiment, load_experiment
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.stages import judging_stages, report_stages, scoring_stages
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.worlds.clips import read_clip
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study import exchange
-from traps_pipeline.study.canary import canary_items
-from traps_pipeline.study.exchange import export_requests
-from traps_pipeline.study.experiment import Experiment, load_experiment
+from traps_pipeline.video.encode import DamagedClip
 
 pytestmark = pytest.mark.slow
 CELL = Cell.parse("occlusion|oracle__standard__run1")
@@ -45,26 +45,26 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     again: list[Callable[[], Any]] = [
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
         refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
-        refused(cards["sheet"], "defs.report._sheets"),
-        refused(cards["gallery"], "defs.report._gallery"),
-        refused(cards["shortcuts"], "defs.report._shortcuts"),
+        refused(cards["sheet"], "pipeline.stages.report_stages._sheets"),
+        refused(cards["gallery"], "pipeline.stages.report_stages._gallery"),
+        refused(cards["shortcuts"], "pipeline.stages.report_stages._shortcuts"),
         refused(
-            lambda: scoring._make_metrics(workspace, "occlusion"),
-            "defs.scoring._make_metrics",
+            lambda: scoring_stages._make_metrics(workspace, "occlusion"),
+            "pipeline.stages.scoring_stages._make_metrics",
         ),
-        refused(lambda: scoring._scored(workspace, "contrasts"), "defs.scoring._scored"),
+        refused(lambda: scoring_stages._scored(workspace, "contrasts"), "pipeline.stages.scoring_stages._scored"),
         refused(
-            lambda: scoring._make_robust(workspace, None),
-            "defs.scoring._make_robust",
+            lambda: scoring_stages._make_robust(workspace, None),
+            "pipeline.stages.scoring_stages._make_robust",
         ),
-        refused(lambda: judging._votes(workspace, "agreement"), "defs.judging._votes"),
+        refused(lambda: judging_stages._votes(workspace, "agreement"), "pipeline.stages.judging_stages._votes"),
         refused(lambda: Annotation(workspace), "explorer.annotate.Annotation.__init__"),
         refused(lambda: study_items(workspace), "explorer.answers.study_items"),
         refused(lambda: Review(workspace, "jd").specs, "explorer.review.Review.specs"),
-        refused(lambda: canary_items(workspace), "study.canary.canary_items"),
+        refused(lambda: canary_items(workspace), "checks.canary.canary_items"),
         refused(
             lambda: export_requests(workspace, experiment, tmp_path / "out"),
-            "study.exchange._cells",
+            "exchange.answer_exchange._cells",
         ),
         refused(lambda: content_of(workspace), "release.content.content_of"),
         refused(
@@ -92,8 +92,8 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     edited(note, "1", "2")
     calls = [
         refused(
-            lambda: list(exchange._wanted_votes(workspace, experiment)),
-            "study.exchange._wanted_votes",
+            lambda: list(answer_exchange._wanted_votes(workspace, experiment)),
+            "exchange.answer_exchange._wanted_votes",
         ),
         refused(
             lambda: build_items(workspace, "occlusion"),
@@ -114,7 +114,7 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     return [*calls, refused(made, "", error=AssertionError)]
 
 
-FILES = {"sheet": report._sheets, "gallery": report._gallery, "shortcuts": report._shortcuts}
+FILES = {"sheet": report_stages._sheets, "gallery": report_stages._gallery, "shortcuts": report_stages._shortcuts}
 
 
 def may_be_made(workspace: Workspace, stage: str) -> Callable[[], None]:

@@ -17,7 +17,7 @@ from tests.build.latex import latex_cells
 from tests.conftest import ROOT
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_BIAS, JUDGE_VALIDATION
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES, workspace_files

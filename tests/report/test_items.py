@@ -6,13 +6,13 @@ import pandas as pd
 import pytest
 
 from tests.build.cells import CELL, write_cell
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report import cell_pages
 from traps_pipeline.report.cell_pages import addresses, index_page, item_pages, page_name, write_item_pages
 from traps_pipeline.report.writing import Behind
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from tests.conftest import ROOT
-from traps_pipeline.defs.mechanism import GROUP
 from traps_pipeline.models.registry import ModelEntry, load_accounts
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.stages.mechanism_stages import GROUP
 from traps_pipeline.report.catalogue import TABLES
 from traps_pipeline.report.published_results import PublishedResults
 

@@ -22,9 +22,9 @@ from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderb
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.worked_example import chosen_example, example_figure, reading
 from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.video.encode import encode
 
 HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"
 REFERENCES = {  # Acc, FalseAbs, AbsRec

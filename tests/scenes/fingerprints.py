@@ -27,9 +27,9 @@ from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.physics.kit import Family, Scene, params_to_dict
 from traps_pipeline.scenes.physics.simulate import replay
-from traps_pipeline.scenes.picture.encode import decode_sampled, encode
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene
+from traps_pipeline.video.encode import decode_sampled, encode
 
 if TYPE_CHECKING:
     import mujoco

@@ -17,9 +17,9 @@ from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, O
 from traps_pipeline.scenes.parts.vision import after_panel, before_hold, before_panel
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.picture.checks import control_frames
-from traps_pipeline.scenes.picture.policies import last_of_all, shown_at_end
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
+from traps_pipeline.video.policies import last_of_all, shown_at_end
 
 FLOOR, NAVY, RED = (200, 200, 188), (18, 28, 71), (219, 26, 31)
 BOARD, RACE = "plinko-0002", "hidden_race-0001"

@@ -25,11 +25,11 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.picture.camera import Camera
-from traps_pipeline.scenes.picture.encode import DamagedClip, decode, encode, frames_digest
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.clips import check_clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import compile_scene
 from traps_pipeline.scenes.worlds.spec import load_trajectory
+from traps_pipeline.video.encode import DamagedClip, decode, encode, frames_digest
 
 
 @pytest.fixture
@@ -70,14 +70,14 @@ def test_a_clip_cut_off_anywhere_is_named_with_the_remedy(clip: Path) -> None:
     whole = clip.read_bytes()
     for kept in [*range(0, len(whole), len(whole) // 40), len(whole) - 1]:
         clip.write_bytes(whole[:kept])
-        with raises(DamagedClip, "scenes.picture.encode.decode", "clip.mp4"):
+        with raises(DamagedClip, "video.encode.decode", "clip.mp4"):
             decode(clip)
 
 
 def test_what_is_no_clip_or_is_not_there_is_named(tmp_path: Path) -> None:
     (tmp_path / "words.mp4").write_text("no clip")
     for name in ("words.mp4", "nothing.mp4"):
-        with raises(DamagedClip, "scenes.picture.encode.decode"):
+        with raises(DamagedClip, "video.encode.decode"):
             decode(tmp_path / name)
 
 
@@ -120,7 +120,7 @@ def test_the_frames_digest_is_over_the_pixels_of_all_frames() -> None:
 
 def test_a_failure_while_encoding_leaves_the_former_clip_and_no_part(clip: Path) -> None:
     before = clip.read_bytes()
-    with raises(Exception, "scenes.picture.encode.encode"):
+    with raises(Exception, "video.encode.encode"):
         encode([*frames(5), np.zeros((7, 7), np.uint8)], clip, 10)
     assert clip.read_bytes() == before
     assert [path.name for path in clip.parent.iterdir()] == ["clip.mp4"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.scenes.picture.policies import fewest_within, shown_at_end
+from traps_pipeline.video.policies import fewest_within, shown_at_end
 
 
 def test_the_frames_of_the_end_are_those_of_all_policies_together() -> None:

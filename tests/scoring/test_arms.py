@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from tests.build.verdicts import JUDGES, Rows, of_arm, write
-from traps_pipeline.defs import judging, scoring
 from traps_pipeline.judging.ratings import VOTE_COLUMNS
+from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
@@ -26,11 +26,11 @@ MODELS = {"oracle": (True, False, True), "prior": (True, True, False)}
 
 def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
     """Every table of figures over the pairs, and every frame that tables and figures of the report are made from."""
-    made: dict[str, Made] = {"contrasts": scoring._make_contrasts(workspace, None)}
+    made: dict[str, Made] = {"contrasts": scoring_stages._make_contrasts(workspace, None)}
     workspace.tables.write(CONTRASTS, {}, made["contrasts"].frame, {})
-    made["regime_tests"] = scoring._make_regime_tests(workspace, None)
-    made["leaderboard"] = scoring._make_leaderboard(workspace, None)
-    votes = judging._votes(workspace, "agreement")
+    made["regime_tests"] = scoring_stages._make_regime_tests(workspace, None)
+    made["leaderboard"] = scoring_stages._make_leaderboard(workspace, None)
+    votes = judging_stages._votes(workspace, "agreement")
     study = StudyResults(workspace)
     frames = {name: getattr(study, name) for name in ("metrics", "sub_cells", "sub_scenarios", "labels", "composition")}
     return {name: one.frame for name, one in made.items()} | frames | {"votes": votes.loc[:, VOTE_COLUMNS]}
@@ -40,7 +40,7 @@ def test_rows_of_arms_beside_the_pairs_change_no_figure(
     rows: Rows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bootstrap.resample, "__defaults__", (50, bootstrap.SEED))
-    monkeypatch.setattr(judging, "_panel", lambda workspace: [*JUDGES])
+    monkeypatch.setattr(judging_stages, "_panel", lambda workspace: [*JUDGES])
     asked = [(model, regime) for model in MODELS for regime in ("standard", "guided")]
     cells = [{"model": model, "regime": regime} for model, regime in asked]
     pairs = [rows([MODELS[c["model"]], (True, False, True)], dataset=d, **c) for c in cells for d in DATASETS]

@@ -12,7 +12,6 @@ from statsmodels.stats.proportion import proportion_confint
 from tests.build.errors import raises
 from tests.judging.conftest import item_row
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -31,6 +30,7 @@ from traps_pipeline.scoring.bootstrap import (
 from traps_pipeline.scoring.contrasts import contrasts, holm, regime_tests, version_contrasts
 from traps_pipeline.scoring.metrics import cell_metrics, wilson
 from traps_pipeline.scoring.standings import leaderboard
+from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -13,7 +13,7 @@ import pytest
 from tests.build.errors import raises
 from tests.build.verdicts import of_arm, write
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.defs import scoring
+from traps_pipeline.pipeline.stages import scoring_stages
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.robust import robust, wrong_rows
@@ -165,10 +165,10 @@ def test_the_stage_writes_a_table_with_arms_and_an_empty_one_without(
     rows: Rows, tmp_path: Path, arms: dict[str, Pairs]
 ) -> None:
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
-    with raises(TrapsError, "defs.scoring._make_robust"):
-        scoring._make_robust(workspace, None)
+    with raises(TrapsError, "pipeline.stages.scoring_stages._make_robust"):
+        scoring_stages._make_robust(workspace, None)
     write(workspace, study(rows, [RIGHT], arms))
-    made = scoring._make_robust(workspace, None)
-    assert scoring._wrong_robust(workspace, None, made) == ""
+    made = scoring_stages._make_robust(workspace, None)
+    assert scoring_stages._wrong_robust(workspace, None, made) == ""
     workspace.tables.write(ROBUST, {}, made.frame, {})
     assert [list(row.arms) for row in workspace.tables.read(ROBUST, {}).itertuples()] == ([list(arms)] if arms else [])

@@ -8,8 +8,8 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.checks.doctor import _damaged_history
 from traps_pipeline.storage.place import place_of
-from traps_pipeline.study.doctor import _damaged_history
 
 
 @pytest.mark.parametrize("name", ["p%41", "q?x"])

@@ -26,8 +26,6 @@ from tests.build.media import IMAGES, VIDEO, drawn, write_clip
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.scenes.picture.encode import DamagedClip, decode, decode_sampled, encode
-from traps_pipeline.scenes.picture.policies import POLICIES, FramePolicy
 from traps_pipeline.storage import media
 from traps_pipeline.storage.media import (
     Media,
@@ -40,6 +38,8 @@ from traps_pipeline.storage.media import (
     profile_digest,
     sample,
 )
+from traps_pipeline.video.encode import DamagedClip, decode, decode_sampled, encode
+from traps_pipeline.video.policies import POLICIES, FramePolicy
 
 QWEN = MediaSpec(profile="frames", uniform=16)
 GRID = MediaSpec(profile="frames", fps=2, most=32)
@@ -185,7 +185,7 @@ def test_a_sample_is_resized_to_width_and_height(clip: tuple[Path, str]) -> None
 def test_a_broken_clip_is_named(tmp_path: Path, store: MediaStore, clip: tuple[Path, str]) -> None:
     path, digest = clip
     path.write_bytes(path.read_bytes()[:-100])
-    with raises(DamagedClip, "scenes.picture.encode.decode", "control.mp4"):
+    with raises(DamagedClip, "video.encode.decode", "control.mp4"):
         sample(path, VIDEO)
     with raises(DamagedClip, "storage.media._require", "control.mp4"):
         store.prepare(path, digest, VIDEO)

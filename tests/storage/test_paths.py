@@ -27,7 +27,7 @@ def test_a_folder_that_dagsters_history_cannot_lie_in_is_refused_before_anything
 
 @pytest.mark.parametrize("name", ["a#b", "a%b", "a b"])
 def test_a_folder_with_other_signs_keeps_a_history(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from traps_pipeline.orchestration.run import dagster_history
+    from traps_pipeline.pipeline.run import dagster_history
 
     monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / name))
     monkeypatch.setenv("DAGSTER_HOME", str(tmp_path / name / "dagster"))

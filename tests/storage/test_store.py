@@ -16,11 +16,11 @@ from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.database import Database
 from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.cluster.places import SharedFolder
+from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store

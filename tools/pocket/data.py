@@ -30,9 +30,9 @@ from traps_pipeline.base.files import replacing, write_text
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import params_to_dict
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.storage.media import pick, resized
+from traps_pipeline.video.encode import encode
 
 SHARD = 50  # scenes
 _MOST_DRAWS = 20  # for each scene of a shard

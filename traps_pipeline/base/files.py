@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -151,3 +152,12 @@ def link(existing: Path, path: Path) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def check_disk(folder: Path, least_gb: float) -> str:
+    """Return the free space at a folder, which need not exist yet, in words. Raises TrapsError where it is less."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    free = shutil.disk_usage(existing).free / 1e9
+    if free < least_gb:
+        raise TrapsError(f"{free:.1f} GB free at {existing}; free at least {least_gb} GB or choose another workspace")
+    return f"{free:.1f} GB free at {existing}"

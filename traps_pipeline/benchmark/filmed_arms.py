@@ -18,18 +18,18 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
-from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import beside_of, sides_of, taxonomy_of_category
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import DamagedClip
 
 KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, **VARIATIONS}
 SECONDS_AN_ARM = 2.0  # of one core, in the mean: one is a clip, or two questions, or a proof that it is refused

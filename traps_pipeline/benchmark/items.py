@@ -11,13 +11,13 @@ from typing import Any
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.specs import expected_specs, released_in_study
-from traps_pipeline.benchmark.tables import ARMS as ARMS_TABLE
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES, BESIDE, SIDES, all_datasets_of, is_ill_posed
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.worlds.clips import check_clip
+from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import DamagedClip
 
 Record = Mapping[str, Any]
 

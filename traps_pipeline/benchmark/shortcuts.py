@@ -76,7 +76,7 @@ def _hits(items: pd.DataFrame, features: np.ndarray, model: Pipeline) -> np.ndar
 def _thumbnail(clip: Path) -> np.ndarray:
     import cv2
 
-    from traps_pipeline.scenes.picture.encode import decode_first
+    from traps_pipeline.video.encode import decode_first
 
     return cv2.resize(decode_first(clip), THUMBNAIL, interpolation=cv2.INTER_AREA).ravel() / 255
 

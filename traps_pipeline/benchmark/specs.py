@@ -17,11 +17,11 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, fold, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
-from traps_pipeline.benchmark.tables import SceneSpecRow
 from traps_pipeline.benchmark.versions import spec_content, version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics, Wording
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
+from traps_pipeline.storage.benchmark_tables import SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
 SECONDS_A_RECORD = 0.04  # of one core, measured: its trajectories are read, and its evidence is measured again

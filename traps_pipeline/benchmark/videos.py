@@ -12,13 +12,13 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
-from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.scenes.parts.look import frame_size
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
 from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, render_pair
+from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import DamagedClip
 
 CLIPS = ("control", "void", "twin")
 SECONDS_A_CLIP = 1.4  # of one core, measured (docs/design/cluster-results.md)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from traps_pipeline.explorer.server import Listening
+    from traps_pipeline.pipeline.experiment import Experiment
     from traps_pipeline.storage.place import Place
     from traps_pipeline.storage.workspace import Workspace
-    from traps_pipeline.study.experiment import Experiment
 
 # Exit codes. For bad usage argparse itself exits with 2.
 OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
@@ -127,7 +127,7 @@ def entered(workspace: Workspace) -> Workspace:
 
 def load_definitions() -> None:
     """Declare the graph, from which staleness is computed, without Dagster."""
-    import traps_pipeline.defs  # noqa: F401 - its import is what declares the graph
+    import traps_pipeline.pipeline.stages  # noqa: F401 - its import is what declares the graph
 
 
 def add_panel(parser: argparse.ArgumentParser) -> None:
@@ -142,6 +142,6 @@ def add_panel(parser: argparse.ArgumentParser) -> None:
 
 def experiment_of(arguments: argparse.Namespace) -> Experiment:
     """The experiment that a command names. Raises TrapsError with the known names."""
-    from traps_pipeline.study.experiment import load_experiment
+    from traps_pipeline.pipeline.experiment import load_experiment
 
     return load_experiment(arguments.experiment)

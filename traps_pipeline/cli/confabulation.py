@@ -22,7 +22,7 @@ def add(commands: Commands) -> None:
 
 def make_sheet(arguments: argparse.Namespace) -> int:
     """See `traps confabulation sheet --help`."""
-    from traps_pipeline.judging.validation import annotation_sheet, write_sheet
+    from traps_pipeline.people.judge_validation import annotation_sheet, write_sheet
 
     rows = annotation_sheet(open_workspace(arguments))
     write_sheet(rows, arguments.file)
@@ -33,8 +33,8 @@ def make_sheet(arguments: argparse.Namespace) -> int:
 
 def write_labels(arguments: argparse.Namespace) -> int:
     """See `traps confabulation labels --help`."""
-    from traps_pipeline.judging.labels import confabulation_rows, human_labels
-    from traps_pipeline.judging.validation import LABEL_COLUMNS, write_sheet
+    from traps_pipeline.people.judge_validation import LABEL_COLUMNS, write_sheet
+    from traps_pipeline.people.labels import confabulation_rows, human_labels
 
     rows = confabulation_rows(human_labels(open_workspace(arguments)))
     write_sheet(rows, arguments.file, LABEL_COLUMNS)
@@ -46,7 +46,7 @@ def write_labels(arguments: argparse.Namespace) -> int:
 
 def validate_judge(arguments: argparse.Namespace) -> int:
     """See `traps confabulation validate --help`."""
-    from traps_pipeline.judging.validation import validate, validation_text
+    from traps_pipeline.people.judge_validation import validate, validation_text
 
     print(validation_text(validate(open_workspace(arguments), arguments.file)))
     return OK

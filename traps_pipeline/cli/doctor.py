@@ -32,7 +32,7 @@ def add(commands: Commands) -> None:
 
 def doctor(arguments: argparse.Namespace) -> int:
     """See `traps doctor --help`."""
-    from traps_pipeline.study.doctor import examine, examine_files, examine_local, examine_unused
+    from traps_pipeline.checks.doctor import examine, examine_files, examine_local, examine_unused
 
     if arguments.verify:
         findings = [*examine_files(place_of(arguments))]

@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace, whole
 
 if TYPE_CHECKING:
-    from traps_pipeline.study.exchange import Imported
+    from traps_pipeline.exchange.answer_exchange import Imported
 
 
 def add(commands: Commands) -> None:
@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
 
 def export_calls(arguments: argparse.Namespace) -> int:
     """See `traps requests export --help`."""
-    from traps_pipeline.study.exchange import REQUESTS, export_request_batches, export_requests
+    from traps_pipeline.exchange.answer_exchange import REQUESTS, export_request_batches, export_requests
 
     experiment = experiment_of(arguments)
     if arguments.batch:
@@ -66,7 +66,7 @@ def export_calls(arguments: argparse.Namespace) -> int:
 def import_given(arguments: argparse.Namespace) -> int:
     """See `traps answers import --help`."""
     from traps_pipeline.benchmark.held_out import held_out_key
-    from traps_pipeline.study.exchange import Whose, import_answers
+    from traps_pipeline.exchange.answer_exchange import Whose, import_answers
 
     experiment = experiment_of(arguments)
     whose = Whose(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
@@ -76,7 +76,7 @@ def import_given(arguments: argparse.Namespace) -> int:
 
 def export_votes(arguments: argparse.Namespace) -> int:
     """See `traps votes export --help`."""
-    from traps_pipeline.study.exchange import export_vote_batches
+    from traps_pipeline.exchange.answer_exchange import export_vote_batches
 
     experiment = experiment_of(arguments)
     files, count = export_vote_batches(open_workspace(arguments), experiment, arguments.out.absolute())
@@ -85,7 +85,7 @@ def export_votes(arguments: argparse.Namespace) -> int:
 
 def import_cast(arguments: argparse.Namespace) -> int:
     """See `traps votes import --help`."""
-    from traps_pipeline.study.exchange import import_votes
+    from traps_pipeline.exchange.answer_exchange import import_votes
 
     experiment = experiment_of(arguments)
     return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "votes")

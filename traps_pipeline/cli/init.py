@@ -9,8 +9,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, add_panel, entered, experiment_of, place_of
 
 if TYPE_CHECKING:
+    from traps_pipeline.pipeline.experiment import Experiment
     from traps_pipeline.storage.workspace import Workspace
-    from traps_pipeline.study.experiment import Experiment
 
 
 def add(commands: Commands) -> None:
@@ -66,7 +66,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     entered(workspace)
     keep(workspace)
     if not (workspace.dagster_home / "dagster.yaml").exists():
-        from traps_pipeline.orchestration.run import dagster_history
+        from traps_pipeline.pipeline.run import dagster_history
 
         with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
             pass

@@ -73,8 +73,8 @@ def move(arguments: argparse.Namespace) -> int:
     from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import TerminalProgress
     from traps_pipeline.storage.place import place_of
+    from traps_pipeline.storage.store_move import move_to_store
     from traps_pipeline.storage.workspace import VARIABLE
-    from traps_pipeline.study.store_move import move_to_store
 
     workspace = open_workspace(arguments)
     with reporting(TerminalProgress()):

@@ -24,7 +24,7 @@ def add(commands: Commands) -> None:
 
 def check(arguments: argparse.Namespace) -> int:
     """See `traps models check --help`."""
-    from traps_pipeline.study.wire_check import check_named
+    from traps_pipeline.checks.wire_check import check_named
 
     names = _named(arguments)
     if arguments.live:
@@ -41,8 +41,8 @@ def _named(arguments: argparse.Namespace) -> list[str]:
     """The ids of models and judges that are named, those of experiments among them. An own entry of the workspace is
     known, too."""
     from traps_pipeline.models.judges import load_panel
+    from traps_pipeline.pipeline.experiment import load_experiment
     from traps_pipeline.storage.workspace import Workspace
-    from traps_pipeline.study.experiment import load_experiment
 
     place = place_of(arguments)
     if Workspace.is_there(place):
@@ -59,9 +59,9 @@ def _named(arguments: argparse.Namespace) -> list[str]:
 
 
 def _check_live(names: list[str]) -> int:
+    from traps_pipeline.checks.live_check import check_live
+    from traps_pipeline.checks.wire_check import participants
     from traps_pipeline.models.registry import NETWORK
-    from traps_pipeline.study.live_check import check_live
-    from traps_pipeline.study.wire_check import participants
 
     known = participants()
     if unknown := [name for name in names if name not in known]:

@@ -20,7 +20,7 @@ from traps_pipeline.cli.command import (
 
 if TYPE_CHECKING:
     from traps_pipeline.models.forecast import Forecast
-    from traps_pipeline.study.plan import Count
+    from traps_pipeline.pipeline.forecast_plan import Count
 
 
 def add(commands: Commands) -> None:
@@ -32,8 +32,8 @@ def add(commands: Commands) -> None:
 
 def plan(arguments: argparse.Namespace) -> int:
     """See `traps plan --help`."""
+    from traps_pipeline.pipeline.forecast_plan import Count, make_plan
     from traps_pipeline.storage.workspace import Workspace
-    from traps_pipeline.study.plan import Count, make_plan
 
     experiment, place = experiment_of(arguments), place_of(arguments)
     workspace = open_workspace(arguments) if Workspace.is_there(place) else None

@@ -28,10 +28,10 @@ from traps_pipeline.cli.init import create
 if TYPE_CHECKING:
     from dagster import DagsterInstance
 
-    from traps_pipeline.orchestration.runs import Runs
+    from traps_pipeline.pipeline.experiment import Experiment
+    from traps_pipeline.pipeline.experiment_run import RunReport
+    from traps_pipeline.pipeline.runs import Runs
     from traps_pipeline.storage.workspace import Workspace
-    from traps_pipeline.study.experiment import Experiment
-    from traps_pipeline.study.experiment_run import RunReport
 
 MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of an experiment and of a study
 
@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
     load_definitions()
-    from traps_pipeline.study.experiment_run import run_experiment
+    from traps_pipeline.pipeline.experiment_run import run_experiment
 
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
     with reporting(TerminalProgress()):
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     _print_work(report, is_inside=experiment.mechanism is not None)
     if experiment.canary and not report.problems:
-        from traps_pipeline.study.canary import ask_canary, changes_text
+        from traps_pipeline.checks.canary import ask_canary, changes_text
 
         with reporting(TerminalProgress()):
             print(changes_text(ask_canary(workspace, experiment.models)))
@@ -156,7 +156,7 @@ def _print_problems(problems: Sequence[str]) -> None:
 def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
     """Who makes the runs: this process, or the hosts of a cluster. Raises TrapsError where there is none."""
     from traps_pipeline.definitions import defs
-    from traps_pipeline.orchestration.runs import RunsHere
+    from traps_pipeline.pipeline.runs import RunsHere
 
     if not arguments.cluster:
         yield RunsHere(instance, defs.resolve_implicit_global_asset_job_def())
@@ -200,9 +200,9 @@ def _check_participant(name: str) -> None:
 
 
 def _print_results(workspace: Workspace) -> None:
+    from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.report.leaderboard_page import leaderboard_text
     from traps_pipeline.report.tables.human_tables import said_by_people
-    from traps_pipeline.scoring.human_score_rows import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 
     said = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))

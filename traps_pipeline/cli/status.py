@@ -29,8 +29,8 @@ def status(arguments: argparse.Namespace) -> int:
         raise TrapsError(
             f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
         )
-    from traps_pipeline.orchestration.lineage import Lineage
-    from traps_pipeline.study.status import stage_statuses
+    from traps_pipeline.pipeline.lineage import Lineage
+    from traps_pipeline.pipeline.study_status import stage_statuses
 
     load_definitions()
     lineage = Lineage(workspace)
@@ -54,7 +54,7 @@ def status(arguments: argparse.Namespace) -> int:
 
 def why(arguments: argparse.Namespace) -> int:
     """See `traps why --help`."""
-    from traps_pipeline.study.why import why as explain
+    from traps_pipeline.pipeline.stale_reasons import why as explain
 
     for line in explain(open_workspace(arguments), arguments.item):
         print(plain(line))

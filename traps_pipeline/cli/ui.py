@@ -32,13 +32,13 @@ def ui(arguments: argparse.Namespace) -> int:
     require("ui")
     from traps_pipeline.base.process_tree import split
     from traps_pipeline.base.webguard import token_for
-    from traps_pipeline.orchestration.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster
+    from traps_pipeline.pipeline.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster
 
     given = arguments.token or optional_key(TOKEN_VARIABLE)
     token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
         return code if code >= 0 else FAILED
-    from traps_pipeline.orchestration.run import dagster_history
+    from traps_pipeline.pipeline.run import dagster_history
     from traps_pipeline.storage.workspace import RUN_CPUS, RUN_GPUS
 
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):

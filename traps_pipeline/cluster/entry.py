@@ -15,7 +15,7 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import dagster as dg
 
-    from traps_pipeline.orchestration.runs import Runs
+    from traps_pipeline.pipeline.runs import Runs
 
 __all__ = ["dagster_yaml", "open_store", "runs", "sensors"]
 

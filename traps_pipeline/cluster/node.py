@@ -37,7 +37,7 @@ def main() -> None:
 
 def _refuse(run_id: str, error: TrapsError) -> NoReturn:
     with suppress(TrapsError):  # then the head hears of it from Ray
-        from traps_pipeline.orchestration.run import dagster_history  # reads registries, which may differ, too
+        from traps_pipeline.pipeline.run import dagster_history  # reads registries, which may differ, too
 
         with dagster_history(Workspace.open()) as instance:
             instance.add_run_tags(run_id, {REFUSED_TAG: "true"})

@@ -24,10 +24,10 @@ from traps_pipeline.cluster.node import REFUSED_TAG
 from traps_pipeline.cluster.requests import REQUEST_TAG, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
 from traps_pipeline.ledger.postgres import PATIENCE_S
-from traps_pipeline.orchestration.graph import Stage, the_graph
-from traps_pipeline.orchestration.ranges import Range, cut, shared_out
-from traps_pipeline.orchestration.runs import Ran, Runs, broke_off, problems_of, range_of, range_tags, reason
-from traps_pipeline.orchestration.step import TAKEN, TALLY
+from traps_pipeline.pipeline.graph import Stage, the_graph
+from traps_pipeline.pipeline.ranges import Range, cut, shared_out
+from traps_pipeline.pipeline.runs import Ran, Runs, broke_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.pipeline.step import TAKEN, TALLY
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
 POLL_S = 1.0

@@ -13,7 +13,7 @@ from functools import cache
 
 import dagster as dg
 
-from traps_pipeline.orchestration.translation import asset_key
+from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.storage.workspace import Workspace
 
 REQUEST_TAG = "traps/request"

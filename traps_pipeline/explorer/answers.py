@@ -16,13 +16,13 @@ import pyarrow as pa
 import pyarrow.compute
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
 from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SIDES
 from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

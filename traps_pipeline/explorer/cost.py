@@ -15,7 +15,7 @@ from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.forecast import Experience, forecast
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, load_models
-from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.workspace import Workspace

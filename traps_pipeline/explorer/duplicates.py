@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.scenes.picture.encode import DamagedClip, decode
+from traps_pipeline.video.encode import DamagedClip, decode
 
 PLACES = (0.0, 0.5, 1.0)  # of the frames that are compared, as shares of the clip
 SIDE = 16  # a frame gives SIDE x SIDE bits: whether a pixel of the reduced frame is brighter than the one on its left

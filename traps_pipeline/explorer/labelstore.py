@@ -24,8 +24,8 @@ from typing import Any
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
-from traps_pipeline.judging.human_label_rows import LABELS_FILE
-from traps_pipeline.judging.labels import label_lines
+from traps_pipeline.people.human_label_rows import LABELS_FILE
+from traps_pipeline.people.labels import label_lines
 from traps_pipeline.storage.lines import append_whole, checked_line
 
 DATABASE = "labels.sqlite"

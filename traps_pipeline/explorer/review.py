@@ -21,15 +21,15 @@ from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
 from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.explorer.cost import Touched, touched
 from traps_pipeline.explorer.duplicates import Comparison
 from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
 from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.pipeline.experiment import EXPERIMENTS
 from traps_pipeline.report.gallery import answer_of_control, certificate_phrases, intervention
+from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.experiment import EXPERIMENTS
 
 SCRIPTS = ("dom.js", "player.js", "listening.js", "review.js")
 STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels
@@ -249,7 +249,7 @@ class Review:
         """The contact strip: frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
         import cv2
 
-        from traps_pipeline.scenes.picture.encode import decode
+        from traps_pipeline.video.encode import decode
 
         self.spec(scenario_id)
         both = [decode(self.clip(scenario_id, side))[0] for side in ("control", "void")]

@@ -22,7 +22,6 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
 from traps_pipeline.models.ask import Call, Settled
@@ -35,6 +34,7 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.ratings import (
@@ -26,6 +25,7 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

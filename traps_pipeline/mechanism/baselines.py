@@ -28,9 +28,9 @@ from traps_pipeline.mechanism.probing import Confabulated, ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import DamagedClip
 
 THUMBNAIL = (32, 24)  # pixels of a frame that a baseline sees, width and height
 NOISE_DRAWS = 10

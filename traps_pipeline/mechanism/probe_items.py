@@ -12,9 +12,9 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.items import categories_of_dataset
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.mechanism.mechanism_rows import ProbeItemRow
 from traps_pipeline.protocol.datasets import ANSWERABLE, TIME_SWAPPED
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
 COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")

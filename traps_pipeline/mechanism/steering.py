@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.deciding import Gate, conditions
 from traps_pipeline.mechanism.degeneracy import degeneracy
@@ -41,6 +40,7 @@ from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Extraction, SteeringCell
 from traps_pipeline.protocol.datasets import SIDES, taxonomy_of
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -12,7 +12,6 @@ from typing import Any
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.framing import framed
 from traps_pipeline.models.participants import Row, when_asked
@@ -23,6 +22,7 @@ from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import ResponseRow
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import dataset_of
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from traps_pipeline.scenes.picture.policies import FramePolicy
 from traps_pipeline.storage.media import MediaSpec
+from traps_pipeline.video.policies import FramePolicy
 
 _RATES = {"frames_few": 2, "frames_all": 10}  # frames a second
 _LATER = {"frames_later": 1}  # frames of the clip

@@ -10,7 +10,7 @@ from traps_pipeline.models.framing import observed
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
-from traps_pipeline.scenes.picture.policies import FramePolicy
+from traps_pipeline.video.policies import FramePolicy
 
 
 @lru_cache(maxsize=100_000)

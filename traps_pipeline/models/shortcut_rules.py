@@ -26,14 +26,14 @@ CUT_FRAMES = 24  # the shortest control has so many, and each cut clip has fewer
 @lru_cache(maxsize=100_000)
 def _panel(media_digest: str, clip: Path) -> bool:
     from traps_pipeline.scenes.parts.vision import largest_board
-    from traps_pipeline.scenes.picture.encode import decode_first
+    from traps_pipeline.video.encode import decode_first
 
     return largest_board(decode_first(clip), PANEL_PX) is not None
 
 
 @lru_cache(maxsize=100_000)
 def _cut(media_digest: str, clip: Path) -> bool:
-    from traps_pipeline.scenes.picture.encode import count_frames
+    from traps_pipeline.video.encode import count_frames
 
     return count_frames(clip) < CUT_FRAMES
 

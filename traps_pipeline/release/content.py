@@ -14,9 +14,9 @@ from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.prompts import prompt, system_prompt
+from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.tables import (
@@ -31,8 +31,8 @@ from traps_pipeline.release.tables import (
 from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of, stored_evidence
 from traps_pipeline.scenes.certification.evidence import Claim
 from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.experiment import LITE_FILE
 
 CLIPS = "clips"
 DATA_LICENCE, PROMPT_LICENCE = "CC-BY-4.0", "CC-BY-NC-4.0"

@@ -24,7 +24,6 @@ from traps_pipeline.base.names import Name
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import RULES_VERSION, load_panel, panel_id
@@ -34,6 +33,7 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.models.thinking import Marks
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.benchmark.tables import AnswerType, ItemRow, Labels, SceneSpecRow, Taxonomy
 from traps_pipeline.scoring.score_rows import LeaderboardRow
 from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.benchmark_tables import AnswerType, ItemRow, Labels, SceneSpecRow, Taxonomy
 from traps_pipeline.storage.tables import Table
 
 Canary = Annotated[str, "the benchmark's canary: a text that must never be trained on holds it"]

@@ -18,7 +18,6 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.benchmark.items import item_hash
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judged_answers import is_correct
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
@@ -36,6 +35,7 @@ from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.submission import Submission
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.scoring.scored import Scored, score
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table
 
 SHOWN = 10  # sentences of one kind; the others are counted

@@ -15,7 +15,7 @@ import pandas as pd
 from traps_pipeline.protocol.datasets import ARMS, PANEL_DOSES, PANEL_LOOKS
 from traps_pipeline.report.contact_sheet import SampledClip, sampled, telling_times
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
-from traps_pipeline.scenes.picture.encode import decode
+from traps_pipeline.video.encode import decode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -20,6 +19,7 @@ from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
 from traps_pipeline.protocol.regimes import GUIDED, STANDARD
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 
 if TYPE_CHECKING:
     import pandas as pd

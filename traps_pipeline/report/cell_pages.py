@@ -18,7 +18,6 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
@@ -28,6 +27,7 @@ from traps_pipeline.protocol.datasets import BESIDE, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.terms import ARM_TITLES, TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 FOLDER = "items"

@@ -13,7 +13,7 @@ import pandas as pd
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.parts.vision import before_panel
-from traps_pipeline.scenes.picture.encode import decode
+from traps_pipeline.video.encode import decode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

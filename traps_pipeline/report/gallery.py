@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.report.writing import environment
-from traps_pipeline.scenes.picture.encode import decode
+from traps_pipeline.video.encode import decode
 
 POSTER_WIDTH, POSTER_HEIGHT = 240, 180
 POSTERS = "gallery"  # folder beside the page

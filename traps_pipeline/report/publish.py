@@ -8,7 +8,6 @@ from pathlib import Path
 import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.cases import cases_files
@@ -31,6 +30,7 @@ from traps_pipeline.report.tables.audited import audit_table
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.terms import INSIDE_TERMS
 from traps_pipeline.report.writing import Behind, environment, figure_files, table_files
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 PAGE, MARKDOWN, METRICS, INDEX = "report.html", "leaderboard.md", "metrics.jsonl", "index.html"

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from traps_pipeline.judging.human_label_rows import HUMAN_AGREEMENT
 from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.control_rows import (
@@ -22,9 +21,10 @@ from traps_pipeline.mechanism.control_rows import (
     STEERING_PECS,
 )
 from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT
+from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROBE_PROMPT
-from traps_pipeline.scoring.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.scoring.score_rows import (
     CONFABULATION_PREVALENCE,
     CONTRASTS,

@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism.effects import in_gaps
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
 from traps_pipeline.mechanism.shares import of_paper
@@ -20,6 +19,7 @@ from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report.contact_sheet import Layout, draw_pair, moments_of, ratio_of
 from traps_pipeline.report.writing import PAGE_IN, figure_style, new_figure, not_run_figure, plain
 from traps_pipeline.scoring.analyses import models_of
+from traps_pipeline.storage.benchmark_tables import ITEMS
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,8 +12,8 @@ from pathlib import Path
 from traps_pipeline.scenes.family_registry import families
 from traps_pipeline.scenes.parts.wording import asked
 from traps_pipeline.scenes.physics.kit import Family
-from traps_pipeline.scenes.picture.encode import decode_sampled
-from traps_pipeline.scenes.picture.policies import SAMPLED, FramePolicy
+from traps_pipeline.video.encode import decode_sampled
+from traps_pipeline.video.policies import SAMPLED, FramePolicy
 
 
 @cache

@@ -28,10 +28,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_bytes
-from traps_pipeline.scenes.picture.encode import ENCODER, DamagedClip, decode, encode
-from traps_pipeline.scenes.picture.policies import FramePolicy
 from traps_pipeline.storage.lines import NOT_WHOLE, checked_line, read_checked
 from traps_pipeline.storage.store import FolderStore, Store
+from traps_pipeline.video.encode import ENCODER, DamagedClip, decode, encode
+from traps_pipeline.video.policies import FramePolicy
 
 Profile = Literal["video", "images", "frames"]
 MOST = 25  # frames an API model sees, docs/spec.md 3.1

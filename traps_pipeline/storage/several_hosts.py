@@ -37,7 +37,7 @@ class SeveralHosts(Protocol):
         ...
 
     def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> Any:
-        """Return the `Runs` that hosts of a cluster make (`orchestration/runs.py`), once those of earlier commands have
+        """Return the `Runs` that hosts of a cluster make (`pipeline/runs.py`), once those of earlier commands have
         ended. options: of `traps run`. Raises TrapsError where no run can be submitted from this host."""
         ...
 

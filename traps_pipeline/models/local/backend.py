@@ -19,8 +19,8 @@ from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.video.encode import DamagedClip
 
 GATHER_S = 0.01  # after the first waiting request, for those that the same answers have set free
 _WORKER = ThreadPoolExecutor(1, thread_name_prefix="local-model")

@@ -15,8 +15,8 @@ from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.settings import Quantisation
 from traps_pipeline.models.local.tiny import Family, build_tiny
 from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
-from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.video.encode import encode
 
 _SPEC = MediaSpec(profile="frames", uniform=4)
 _SYSTEM, _QUESTION = "You are asked about a video.", "Does it grow brighter?"

@@ -34,12 +34,12 @@ from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Scene, fl
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import in_frame
-from traps_pipeline.scenes.picture.policies import POLICIES, fewest_within, last_of_all, shown_at_end
 from traps_pipeline.scenes.picture.walls import FACES_THE_EYE_DEG, outlines
 from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, decisive_geoms, read_outcome
 from traps_pipeline.scenes.worlds.pace import EARLIEST_SHARE, LATEST_SHARE, out_of_pace, settles_share
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
+from traps_pipeline.video.policies import POLICIES, fewest_within, last_of_all, shown_at_end
 
 if TYPE_CHECKING:
     import mujoco

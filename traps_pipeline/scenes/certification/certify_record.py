@@ -14,9 +14,9 @@ import numpy as np
 
 from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of
 from traps_pipeline.scenes.certification.evidence import Pair
-from traps_pipeline.scenes.picture.encode import frames_digest
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
+from traps_pipeline.video.encode import frames_digest
 
 
 @dataclass(frozen=True)

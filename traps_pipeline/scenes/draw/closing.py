@@ -22,9 +22,9 @@ from traps_pipeline.scenes.parts.readings import still_from
 from traps_pipeline.scenes.physics.kit import Box
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture.camera import Closing, Panel, fit_panel
-from traps_pipeline.scenes.picture.policies import last_of_all
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.world import World
+from traps_pipeline.video.policies import last_of_all
 
 READ_BY_DRAW_S = 1.0  # so long the outcome is in view where there is time for it
 REST_BY_DRAW_S = 0.6  # so long it has been at rest by then: three frames of five a second

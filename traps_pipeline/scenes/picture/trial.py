@@ -48,7 +48,7 @@ def encode_clip() -> str:
     """Encode three frames and read them back. Raises TrapsError."""
     import numpy as np
 
-    from traps_pipeline.scenes.picture.encode import decode, encode
+    from traps_pipeline.video.encode import decode, encode
 
     frames = [np.full((360, 480, 3), shade, np.uint8) for shade in (40, 80, 120)]
     try:

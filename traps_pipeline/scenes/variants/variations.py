@@ -19,12 +19,12 @@ from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.wording import asked, choices_in
 from traps_pipeline.scenes.physics.kit import listed
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.policies import shown_at_end
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, moving_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
+from traps_pipeline.video.policies import shown_at_end
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 

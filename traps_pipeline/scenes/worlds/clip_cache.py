@@ -17,9 +17,9 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import PACKAGE, user_cache
-from traps_pipeline.scenes.picture.encode import DamagedClip
 from traps_pipeline.scenes.picture.render import RenderingUnavailable, drawn_by
 from traps_pipeline.scenes.worlds.clips import note_of, read_clip, read_note
+from traps_pipeline.video.encode import DamagedClip
 
 VARIABLE = "TRAPS_CLIP_CACHE"  # at most so many GB, or "off"
 DEFAULT_GB = 4.0
@@ -135,7 +135,7 @@ def _remove(entry: Path) -> None:
 
 @cache
 def _renderer() -> str:
-    """Return a digest of what turns a scene into bytes: this room's code, OpenGL, MuJoCo, OpenCV and the encoder.
+    """Return a digest of what turns a scene into bytes: code of `scenes` and `video`, OpenGL, MuJoCo, OpenCV, encoder.
 
     Raises RenderingUnavailable.
     """
@@ -143,7 +143,7 @@ def _renderer() -> str:
     import cv2
     import mujoco
 
-    scenes = PACKAGE / "scenes"
-    code = {path.relative_to(scenes).as_posix(): file_digest(path) for path in sorted(scenes.rglob("*.py"))}
+    files = sorted(path for room in ("scenes", "video") for path in (PACKAGE / room).rglob("*.py"))
+    code = {path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in files}
     versions = (mujoco.__version__, cv2.__version__, av.__version__, sorted(av.library_versions.items()))
     return digest([code, drawn_by(), versions])

@@ -19,11 +19,11 @@ from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Family, Physics, Scene
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import Camera, Panel
-from traps_pipeline.scenes.picture.encode import DamagedClip, encode, frames_digest
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import closing_of
+from traps_pipeline.video.encode import DamagedClip, encode, frames_digest
 
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
 

@@ -1,0 +1,291 @@
+"""Every entry of the registry sends exactly what it declares, and the check reports every difference."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.checks import wire_check
+from traps_pipeline.checks.loopback import render
+from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
+from traps_pipeline.checks.wire_check import check_named, examine, requests_of
+from traps_pipeline.cli import main
+from traps_pipeline.models import api
+from traps_pipeline.models.registry import JSON_ANSWER, ModelEntry, get_model, load_models
+from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
+
+pytestmark = pytest.mark.slow  # litellm's import
+
+PAPER = [
+    "gemini-2.5-pro",
+    "gemini-2.5-flash",
+    "gemini-2.5-flash-nt",
+    "gemini-3.1-pro",
+    "gemini-3.1-pro-r-low",
+    "gemini-3.1-flash-lite",
+    "qwen3-vl-think",
+    "qwen3-vl-instruct",
+    "qwen3-vl-8b",
+    "gpt-5-pro",
+    "gpt-5-high",
+    "gpt-5-medium",
+    "gpt-5-nr",
+    "gpt-5-mini",
+    "gemma-4-e4b",
+    "llava-next-video-7b",
+]  # docs/spec.md 3.2
+CHECKED = [name for name, entry in wire_check.participants().items() if entry.backend in ("api", "local")]
+
+
+def altered(name: str, params: dict[str, Any] | None = None, **changes: Any) -> ModelEntry:
+    """An entry of the registry with other values, unchecked; a parameter that is None is left out."""
+    entry = get_model(name)
+    merged = entry.params | (params or {})
+    return entry.model_copy(update=changes | {"params": {p: v for p, v in merged.items() if v is not None}})
+
+
+def bodies(name: str) -> dict[str, WireBody]:
+    requests = requests_of(get_model(name))
+    found = dict(zip(requests, render(get_model(name), list(requests.values())), strict=True))
+    assert all(isinstance(body, WireBody) for body in found.values()), found
+    return found  # pyright: ignore[reportReturnType]
+
+
+# --- what is released -------------------------------------------------------------------------------------------------
+
+
+def test_the_sixteen_configurations_are_there_in_the_papers_order() -> None:
+    assert [name for name in load_models() if name in PAPER] == PAPER
+    assert [get_model(name).runs for name in PAPER] == [1 if name == "qwen3-vl-8b" else 3 for name in PAPER]
+    groups = [get_model(name).groups for name in PAPER]
+    assert [g.group for g in groups].count("main") == 14
+    assert [(g.group, g.input) for g in groups].count(("main", "video")) == 9
+    assert [g.input for g in groups].count("image") == 5
+
+
+@pytest.mark.parametrize("name", CHECKED)
+@pytest.mark.promise
+def test_an_entry_sends_what_it_declares(name: str) -> None:
+    (checked,) = check_named([name])
+    assert checked.problems == []
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("qwen3-vl-8b", "16 frames of 480 x 360 at 0 0.3 0.7 ... 4.9 s"),
+        ("gemma-4-e4b", "10 frames of 480 x 360 at 0 0.5 1 ... 4.5 s"),
+        ("llava-next-video-7b", "10 frames of 336 x 336 at 0 0.5 1 ... 4.5 s"),
+        ("gemini-2.5-pro", "/v1beta/models/gemini-2.5-pro:generateContent  video 25 frames"),
+        ("qwen3-vl-instruct", "/compatible-mode/v1/chat/completions  video 25 frames"),
+        ("gpt-5-nr", "/v1/responses  images 25 frames"),
+    ],
+)
+def test_the_frames_are_those_of_the_protocol(name: str, shown: str) -> None:
+    (checked,) = check_named([name])
+    assert shown in checked.line
+
+
+@pytest.mark.parametrize(
+    ("name", "schema"),
+    [("gemini-2.5-pro", "responseJsonSchema"), ("gpt-5-high", "text.format"), ("qwen3-vl-instruct", "response_format")],
+)
+def test_a_schema_is_sent_in_the_json_regime_alone(name: str, schema: str) -> None:
+    for regime, body in bodies(name).items():
+        sent = [field for field in read_body(body).fields if field.endswith(schema)]
+        assert len(sent) == (regime == "json"), regime
+    assert [f for body in bodies("qwen3-vl-think").values() for f in read_body(body).fields if "format" in f] == []
+
+
+def test_the_clip_in_the_body_is_the_one_that_was_prepared() -> None:
+    for name, images in (("gemini-3.1-pro", 1), ("qwen3-vl-think", 1), ("gpt-5-mini", 25)):
+        sent = requests_of(get_model(name))["standard"].sent
+        assert sent is not None
+        _, user = read_body(bodies(name)["guided"]).turns[1]
+        clips = [part for part in user if isinstance(part, ClipPart)]
+        assert (len(clips), [clip.data for clip in clips]) == (images, payload(sent))
+        assert {clip.fps for clip in clips} == {sent.fps} == {None if images > 1 else 5}
+
+
+# --- what must not pass -----------------------------------------------------------------------------------------------
+
+
+def test_gemini_drops_a_video_url_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    def as_video_url(media: Media, _: str) -> list[dict[str, Any]]:
+        return [{"type": "video_url", "video_url": {"url": data_uris(media)[0]}, "fps": 5}]
+
+    monkeypatch.setattr(api, "media_parts", as_video_url)
+    assert examine(get_model("gemini-2.5-pro")).problems == ["media: 0 of 1 videos arrive"]
+
+
+def test_gemini_is_not_told_the_rate_of_a_video_sent_as_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    def as_image_url(media: Media, _: str) -> list[dict[str, Any]]:
+        return [{"type": "image_url", "image_url": {"url": data_uris(media)[0]}}]
+
+    monkeypatch.setattr(api, "media_parts", as_image_url)
+    assert examine(get_model("gemini-2.5-pro")).problems == ["media.fps: 5 is declared, None arrives"]
+
+
+@pytest.mark.parametrize("name", ["gemini-3.1-flash-lite", "qwen3-vl-think"])
+def test_another_rate_than_the_clips_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = api.media_parts
+
+    def at_one_fps(media: Media, route: str) -> list[dict[str, Any]]:
+        (part,) = honest(media, route)
+        if "file" in part:
+            return [part | {"file": part["file"] | {"video_metadata": {"fps": 1}}}]
+        return [part | {"fps": 1}]
+
+    monkeypatch.setattr(api, "media_parts", at_one_fps)
+    assert examine(get_model(name)).problems == ["media.fps: 5 is declared, 1 arrives"]
+
+
+def test_an_image_too_few_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = api.media_parts
+    monkeypatch.setattr(api, "media_parts", lambda media, route: honest(media, route)[1:])
+    assert examine(get_model("gpt-5-nr")).problems == ["media: 24 of 25 images arrive"]
+
+
+def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = api.media_parts
+    hint = {"type": "text", "text": "These are 25 frames."}
+    monkeypatch.setattr(api, "media_parts", lambda media, route: [*honest(media, route), hint])
+    assert examine(get_model("gpt-5-nr")).problems == ["something other than clip and question arrives"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "complaint"),
+    [
+        pytest.param(
+            altered("gemini-2.5-pro", media=MediaSpec(profile="video", fps=1)),
+            "media: {5} frames of a 5 s clip are sent, the protocol has 25",
+            id="one frame a second",
+        ),
+        pytest.param(
+            altered("gpt-5-high", {"temperature": 0.8}),
+            "gpt-5 doesn't support temperature=0.8 while reasoning is active",
+            id="a parameter that the model refuses is not dropped silently",
+        ),
+        pytest.param(
+            altered("gpt-5-high", {"temperature": 0.8, "drop_params": True}),
+            "temperature: 0.8 is declared and not sent",
+            id="a parameter that the library was told to drop",
+        ),
+        pytest.param(
+            altered("gpt-5-nr", provider_id="openai/gpt-5"),
+            "max_tokens: 8000 is declared and not sent",
+            id="the wrong API's name of a parameter",
+        ),
+        pytest.param(
+            altered("gemini-3.1-pro", {"temperature": None}),
+            "generationConfig.temperature: 1.0 is sent and not declared",
+            id="a default of the library",
+        ),
+        pytest.param(
+            altered("gemini-2.5-flash", {"thinkingConfig": None, "reasoning_effort": "high"}),
+            "generationConfig.thinkingConfig.thinkingBudget: 4096 is sent and not declared",
+            id="a setting that the library translates",
+        ),
+        pytest.param(
+            altered("gemini-3.1-pro", {"thinkingConfig": None, "reasoning_effort": "none"}),
+            'generationConfig.thinkingConfig.thinkingLevel: "low" is sent and not declared',
+            id="an effort of none that is made low",
+        ),
+        pytest.param(
+            altered("qwen3-vl-think", {"user": "me"}),
+            'user: "me" is declared and not sent',
+            id="a parameter that the library drops unasked",
+        ),
+        pytest.param(
+            altered("qwen3-vl-think", {"note": "placeholder-of-a-key"}),
+            "the API key is in the body or the address",
+            id="a key in the body",
+        ),
+        pytest.param(
+            altered("qwen3-vl-think", {"response_format": JSON_ANSWER}),
+            "standard: structured output is for the JSON regime alone",
+            id="a schema in every regime",
+        ),
+    ],
+)
+def test_an_altered_entry_is_told_what_is_wrong(entry: ModelEntry, complaint: str) -> None:
+    problems = examine(entry).problems
+    assert any(complaint in problem for problem in problems), problems
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("waivers: {temperature: refused}", r"params\.top_p is not sent, the protocol has 0\.95: .* under waivers"),
+        ("params: {temperature: 0.2}, waivers: {top_p: refused, max_tokens: long}", r"params\.temperature is 0\.2"),
+        ("params: {temperature: 0.8}, waivers: {temperature: x, top_p: x}", r"waivers\.temperature: is sent as"),
+    ],
+)
+def test_a_missing_waiver_names_entry_and_field(tmp_path: Path, line: str, complaint: str) -> None:
+    path = tmp_path / "models.yaml"
+    media = "media: {profile: images, fps: 5}"
+    path.write_text(
+        f"models:\n  - {{id: mine, backend: api, account: openai, provider_id: openai/gpt-5, {media}, {line}}}\n"
+    )
+    with pytest.raises(TrapsError, match=rf"models\.yaml: model 1 \(mine\): .*{complaint}"):
+        load_models(path)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+OFFLINE = """
+import socket, sys
+
+def connect(self, address, connect=socket.socket.connect):
+    if address[0] != "127.0.0.1":
+        print("reached for", address)
+        raise OSError("no network")
+    return connect(self, address)
+
+def resolve(host, *args, resolve=socket.getaddrinfo, **kwargs):
+    if host != "127.0.0.1":
+        print("looked up", host)
+        raise socket.gaierror("no network")
+    return resolve(host, *args, **kwargs)
+
+socket.socket.connect, socket.getaddrinfo = connect, resolve
+from traps_pipeline.cli import main
+sys.exit(main(["models", "check", "gemini-2.5-pro", "gpt-5-nr", "qwen3-vl-think", "judge-claude-opus-4.6"]))
+"""
+
+
+def test_the_command_needs_neither_keys_nor_a_network() -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_API_KEY")}
+    environment |= {"HTTP_PROXY": "http://127.0.0.1:9", "HTTPS_PROXY": "http://127.0.0.1:9"}
+    done = subprocess.run(
+        [sys.executable, "-c", OFFLINE], env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [line.split()[0] for line in lines[:-1]] == [
+        "gemini-2.5-pro",
+        "qwen3-vl-think",
+        "gpt-5-nr",
+        "judge-claude-opus-4.6",
+    ]
+    assert lines[-1] == "every entry sends what it declares"
+    assert done.stderr == ""
+
+
+def test_the_command_fails_where_an_entry_does(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = altered("gpt-5-nr", {"temperature": 0.8})
+    monkeypatch.setattr(wire_check, "participants", lambda: {"gpt-5-nr": broken})
+    assert main(["models", "check"]) == 1
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == f"{'gpt-5-nr':<24} nothing caught"
+    assert printed[1].startswith("    0 requests were sent")
+    assert printed[-1] == "1 entries do not send what they declare"
+    assert main(["models", "check", "gpt-6"]) == 1

@@ -1,0 +1,3 @@
+"""The tests of this folder need the declared graph."""
+
+import traps_pipeline.definitions  # noqa: F401

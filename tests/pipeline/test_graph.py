@@ -1,0 +1,127 @@
+"""The graph that decides what is stale and in which order things are made is the one that Dagster draws."""
+
+from __future__ import annotations
+
+import random
+
+import dagster as dg
+import pytest
+
+from tests.tables import TABLES
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.definitions import defs
+from traps_pipeline.pipeline import stage as declaration
+from traps_pipeline.pipeline.graph import JOB_GROUPS, the_graph
+from traps_pipeline.pipeline.translation import asset_key
+from traps_pipeline.storage.parquet import Made
+
+DAGSTER = defs.get_repository_def().asset_graph
+GRAPH = the_graph()
+STAGES = [stage.name for stage in GRAPH.stages]
+
+
+def parents(stage: str, key: str | None) -> set[tuple[str, str | None]]:
+    """Dagster's parents of a partition. A parent without partitions is one node; a child without takes every key."""
+    asset = dg.AssetKey(stage)
+    found: set[tuple[str, str | None]] = set()
+    definition = DAGSTER.get(asset).partitions_def
+    subset = definition.subset_with_partition_keys([key]) if definition is not None and key is not None else None
+    for parent in DAGSTER.get(asset).parent_keys:
+        name, above = parent.to_user_string(), DAGSTER.get(parent).partitions_def
+        if above is None:
+            found.add((name, None))
+            continue
+        mapping = DAGSTER.get_partition_mapping(asset, parent)
+        mapped = mapping.get_upstream_mapped_partitions_result_for_partitions(subset, definition, above)
+        assert not mapped.required_but_nonexistent_subset.get_partition_keys()
+        found |= {(name, str(k)) for k in mapped.partitions_subset.get_partition_keys()}
+    return found
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_partition_is_made_from_what_dagster_says(stage: str) -> None:
+    keys = GRAPH.keys(stage)
+    for key in random.Random(3).sample(keys, min(len(keys), 8)):
+        ours = [(parent, k) for parent, above in GRAPH.parents(stage, key).items() for k in above]
+        assert len(ours) == len(set(ours))
+        assert set(ours) == parents(stage, key)
+
+
+def test_dagster_knows_the_stages_and_sources_that_are_declared_and_no_others() -> None:
+    assert {key.to_user_string() for key in DAGSTER.get_all_asset_keys()} == {*STAGES, *GRAPH.sources}
+
+
+def test_every_stage_stands_behind_what_it_is_made_from() -> None:
+    made = set(GRAPH.sources)
+    for stage in STAGES:
+        assert GRAPH.parents_of[stage].keys() <= made
+        made.add(stage)
+
+
+def test_a_block_shares_its_partitions_and_blocks_are_few() -> None:
+    for block in GRAPH.blocks():
+        assert len({id(stage.scheme) for stage in block}) == 1
+    without = [name for name in STAGES if GRAPH[name].group != "mechanism"]
+    named = [[stage.name for stage in block] for block in GRAPH.blocks(without)]
+    assert named[:4] == [["scene_specs", "videos", "arms"], ["items"], ["responses", "votes", "verdicts"], ["metrics"]]
+    assert len(named) == 5  # what has no partitions is one run
+
+
+def test_tables_are_partitioned_as_their_stages_keys_say() -> None:
+    tables = {stage.table.name: stage for stage in GRAPH.stages if stage.table is not None}
+    assert tables.keys() <= {*TABLES}
+    for name, stage in tables.items():
+        assert tuple(stage.columns(GRAPH.keys(name)[0])) == TABLES[name].partition_by
+
+
+def test_every_asset_says_who_owns_it_what_it_is_and_which_code_makes_it() -> None:
+    for stage in GRAPH.stages:
+        spec = DAGSTER.get(asset_key(stage.name))
+        assert spec.owners and spec.kinds and spec.code_version and spec.description, stage.name
+        assert spec.metadata.get("dagster/column_schema") is not None or stage.table is None
+
+
+def test_what_can_cost_money_is_marked() -> None:
+    assert {s.name for s in GRAPH.stages if s.cost == "money"} == {
+        "responses",
+        "votes",
+        "confabulation",
+        "steering_votes",
+    }
+    assert {s.name for s in GRAPH.stages if s.cost == "machine"} == {
+        *("hidden_states", "steering"),
+        *("probe_baselines", "gate", "risk_coverage", "patching"),
+    }
+
+
+def test_an_unknown_stage_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(TrapsError, match=r"no stage 'stages'; choose from scene_specs, videos"):
+        _ = GRAPH["stages"]
+
+
+def test_every_stage_is_made_by_one_job_and_by_the_job_of_everything() -> None:
+    groups = [group for groups in JOB_GROUPS.values() for group in groups]
+    assert len(groups) == len(set(groups))
+    assert {stage.group for stage in GRAPH.stages} == set(groups)
+    assert {job.name for job in defs.jobs or ()} == {*JOB_GROUPS, "everything"}
+
+
+def test_the_report_is_a_job_of_assets_and_its_selection_is_its_group() -> None:
+    job = defs.resolve_job_def("report")
+    made = {key.path[-1] for key in job.asset_layer.executable_asset_keys}
+    assert made == {stage.name for stage in GRAPH.stages if stage.group == "report"}
+
+
+def test_each_asset_shows_the_sensors_that_make_it_again() -> None:
+    repository, free = defs.get_repository_def(), {asset_key(s.name) for s in GRAPH.stages if not s.cost}
+    for name, expected in (
+        ("follow_corrections", free),
+        ("follow_corrections_paid", {asset_key(s.name) for s in GRAPH.stages}),
+    ):
+        selection = repository.get_sensor_def(name).asset_selection
+        assert selection is not None and selection.resolve(repository.asset_graph) == expected
+
+
+def test_a_group_that_no_job_makes_is_refused_where_it_is_declared() -> None:
+    with pytest.raises(ValueError, match="no job makes the group extras; add it to JOB_GROUPS"):
+        declaration.stage("extra", lambda workspace, key: Made({}), group="extras", parents=[])

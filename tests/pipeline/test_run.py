@@ -1,0 +1,92 @@
+"""Batches of partitions: ranges that Dagster expands to exactly the keys asked for."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from dagster import AssetObservation, PartitionKeyRange
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.ranges import batches
+from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.pipeline.schemes import CELL, DATASET
+from traps_pipeline.pipeline.translation import partitions_of
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+
+CELLS = [str(key) for key in the_graph().keys("responses")]
+
+
+def expanded(keys: Sequence[str]) -> Counter[str]:
+    """What Dagster makes of the batches of some keys: how often each key is run."""
+    ran: Counter[str] = Counter()
+    for first, last in batches(CELL, list(keys)):
+        assert first is not None and last is not None
+        ran.update(str(key) for key in partitions_of(CELL).get_partition_keys_in_range(PartitionKeyRange(first, last)))
+    return ran
+
+
+def test_batches_of_any_cells_run_each_once_and_no_other() -> None:
+    rng = random.Random(7)
+    for size in [1, 2, 3, 5, 10, 30, len(CELLS) // 2, len(CELLS) - 1] * 3:
+        keys = rng.sample(CELLS, size)
+        assert expanded(keys) == Counter(keys)
+
+
+@pytest.mark.parametrize("datasets", [DATASETS, DATASETS[:2], DATASETS[1:3], ("occlusion", "chaotic_ill_posed")])
+def test_whole_models_are_few_runs(datasets: Sequence[str]) -> None:
+    oracle = [e for e in Wanted(None).evaluations if e.model in ("oracle", "always-abstain")]
+    keys = [Cell(dataset, e).key for e in oracle for dataset in datasets]
+    assert expanded(keys) == Counter(keys)
+    neighbours = 1 if datasets != ("occlusion", "chaotic_ill_posed") else 2
+    assert len(list(batches(CELL, keys))) == neighbours
+
+
+def test_a_gap_makes_two_ranges() -> None:
+    one_dataset = [key for key in CELLS if key.startswith("chaotic|")]
+    without = one_dataset[:3] + one_dataset[4:]
+    assert list(batches(CELL, without)) == [(without[0], without[2]), (without[3], without[-1])]
+
+
+def test_neighbours_of_one_dimension_are_one_range_and_no_keys_are_no_run() -> None:
+    assert list(batches(CELL, [])) == []
+    assert list(batches(DATASET, ["occlusion", "occlusion_ill_posed", "chaotic_ill_posed"])) == [
+        ("occlusion", "occlusion_ill_posed"),
+        ("chaotic_ill_posed", "chaotic_ill_posed"),
+    ]
+    assert list(batches(None, [None])) == [(None, None)]
+
+
+@pytest.mark.parametrize("damage", ["gone", "no database"])
+def test_a_history_that_is_lost_begins_anew(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    monkeypatch.setenv("DAGSTER_HOME", str(workspace.dagster_home))
+    with dagster_history(workspace) as history:
+        history.report_runless_asset_event(AssetObservation("questions", tags={"dagster/data_version": "1"}))
+    if damage == "gone":
+        shutil.rmtree(workspace.dagster_home)
+    else:
+        (workspace.dagster_home / "history" / "runs" / "index.db").write_bytes(b"no database" * 500)
+    with dagster_history(workspace) as history:
+        assert history.all_asset_keys() == [] and history.get_runs_count() == 0
+    assert ("history was damaged; it lies in broken-" in capsys.readouterr().err) == (damage != "gone")
+
+
+def test_a_file_in_the_place_of_dagsters_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    monkeypatch.delenv("DAGSTER_HOME", raising=False)
+    workspace.dagster_home.rmdir()
+    workspace.dagster_home.touch()
+    with pytest.raises(TrapsError, match=r"a file.* move that"), dagster_history(workspace):
+        pass

@@ -1,0 +1,1 @@
+"""Checks before money is spent: the machine, the requests as bytes, the live endpoint."""

@@ -1,0 +1,159 @@
+"""The canary: twenty fixed items that a run asks again in each epoch, to see whether a model changed under its name.
+
+An epoch that is named in `study.yaml` is asked once. Answers are read by rules, whatever panel judges the study: the
+same reader on both sides shows a change of the model, and of nothing else. Answers are sampled, so some change is
+chance; how many changed between two epochs in which nothing happened is the measure for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Annotated, Any
+
+import pandas as pd
+
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import text_table
+from traps_pipeline.judging.judged_answers import UNREAD
+from traps_pipeline.judging.rules import read_statement
+from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.reading import read_answer
+from traps_pipeline.models.registry import NETWORK, ModelEntry, get_model
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+N_ITEMS = 20
+CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # names the folder of the calls, not a model
+REGIME = "json"  # its final answers are the texts of free models that rules read most often
+COMPARED = ("outcome", "abstained", "value")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CanaryRow:
+    """One answer to one of the canary's items in one epoch."""
+
+    model: shared.Model
+    item_id: shared.ItemId
+    epoch: shared.Epoch
+    served_model: Annotated[str | None, "what the provider says answered"]
+    outcome: Annotated[str, "as in responses, or unread: the rules know no form of the text"]
+    text: Annotated[str | None, "the answer; null unless outcome is answer or unread"]
+    abstained: Annotated[bool | None, "as rules read it; null without an answer that they read"]
+    value: Annotated[str | None, "what it commits to, as rules read it; null where it abstains or is no answer"]
+    prompt_tokens: shared.Tokens
+    created_at: shared.AskedAt
+
+
+# A command makes this table, so it is no stage; `traps run` writes it where an experiment says `canary: true`.
+CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "epoch"))
+
+
+def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
+    """The items of the canary: of each dataset of the pairs those with the smallest digests, so that they stay the same
+    while the benchmark does. Raises TrapsError where no items are made."""
+    items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
+    if not items:
+        raise TrapsError("canary: no items yet; materialize items first")
+    datasets = [name for name in DATASETS if any(item["dataset"] == name for item in items)]
+    chosen = list[dict[str, Any]]()
+    for dataset in datasets:
+        mine = sorted((i for i in items if i["dataset"] == dataset), key=lambda item: digest(item["item_id"]))
+        chosen += mine[: N_ITEMS // len(datasets)]
+    return chosen
+
+
+@dataclass(frozen=True)
+class _Asked(Call):
+    entry: ModelEntry
+    item: Mapping[str, Any]
+
+
+def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
+    """CANARY rows of all epochs, after asking these models over the network what they were not asked in the study's
+    epoch; the table is written. Raises what asking raises."""
+    epoch, items = workspace.study.epoch, canary_items(workspace)
+    entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
+    calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]
+
+    def finish(settled: Settled[Cell, _Asked]) -> list[CanaryRow]:
+        return [_row(call, row, epoch) for call, row in settled.answered()]
+
+    new = list[CanaryRow]()
+    if calls:
+        (new,) = collect(workspace, "canary", workspace.answers, entries, [CELL], lambda _: calls, finish)
+    made = pd.DataFrame([vars(row) for row in new], columns=pd.Index(CANARY.names))
+    if workspace.tables.state(CANARY, {}) is not None:
+        old = workspace.tables.read(CANARY, {})
+        made = pd.concat([old.loc[~old["epoch"].eq(epoch) | ~old["model"].isin(models)], made], ignore_index=True)
+    workspace.tables.write(CANARY, {}, made, {})
+    return made
+
+
+def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], epoch: str) -> Any:
+    asked = answer_request(workspace, entry, item, Evaluation(entry.id, REGIME, 1))
+    return replace(asked, about={**asked.about, "canary": epoch})
+
+
+def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
+    read = read_answer(row, None, REGIME, thinking=call.entry.thinking)
+    statement = None if read.text is None else read_statement(read.text, call.item["question"])
+    return CanaryRow(
+        model=call.entry.id,
+        item_id=call.item["item_id"],
+        served_model=row["served_model"],
+        outcome=UNREAD if read.text is not None and statement is None else read.outcome,
+        text=read.text,
+        abstained=statement and statement.value is None,
+        value=statement and statement.value,
+        prompt_tokens=row["prompt_tokens"],
+        epoch=epoch,
+        created_at=when_asked(row)["created_at"],
+    )
+
+
+def changes(rows: pd.DataFrame) -> pd.DataFrame:
+    """What changed from each epoch of a model to its next one, from CANARY rows: model, from, to, served (names then
+    and now), n (items asked in both), outcome, abstained and value (numbers of items that changed in it), tokens (mean
+    change of prompt tokens)."""
+    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # of each model, in the order of asking
+    for row in rows.sort_values(["model", "created_at"], kind="stable").to_dict("records"):
+        by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
+    found = list[dict[str, Any]]()
+    for model, epochs in by_epoch.items():
+        for then, now in pairwise(epochs):
+            both = [(epochs[then][item], row) for item, row in epochs[now].items() if item in epochs[then]]
+            served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
+            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _counted(old, new)]
+            found.append(
+                {"model": model, "from": then, "to": now, "served": " -> ".join(served), "n": len(both)}
+                | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
+                | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
+            )
+    return pd.DataFrame(found, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
+
+
+def _counted(*rows: Mapping[str, Any]) -> bool:
+    return all(not pd.isna(row["prompt_tokens"]) for row in rows)
+
+
+def _said(value: Any) -> str:
+    """A value of a table for comparison; null equals null, however a file brings it back."""
+    return "" if pd.isna(value) else str(value)
+
+
+def changes_text(rows: pd.DataFrame) -> str:
+    """The changes as a table for a person; a sentence where no model was asked in two epochs."""
+    table = changes(rows)
+    if table.empty:
+        return "canary: asked in this epoch; name another epoch in study.yaml to ask again, and what changed is shown"
+    shown = [[*row[:-1], "-" if row[-1] != row[-1] else f"{row[-1]:+.1f}"] for row in table.itertuples(index=False)]
+    return "canary: items that changed\n" + text_table(list(table), shown)

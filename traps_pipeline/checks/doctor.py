@@ -1,0 +1,267 @@
+"""`traps doctor`: which steps of a study this machine can do, and what to install for the others."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import PART, check_disk
+from traps_pipeline.base.keys import optional_key
+from traps_pipeline.base.network import check_network
+from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
+from traps_pipeline.storage.place import Place, scratch_of
+
+if TYPE_CHECKING:
+    from traps_pipeline.mechanism.adapter_checks import Subject
+
+MIN_FREE_GB = 1.0
+STATES = ("*.safetensors", "*.parquet")  # files of an extraction
+FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
+SHOWN = 5  # damaged files of a kind that are named
+UNFINISHED_AFTER_S = 24 * 3600.0  # no file takes so long to write
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one examination."""
+
+    ok: bool
+    what: str
+    detail: str
+
+
+def examine(place: Place) -> Iterator[Finding]:
+    """One finding for each requirement of the demo."""
+    for what, look in (
+        ("python", _python),
+        ("checkout", _checkout),
+        ("rendering", draw_frame),
+        ("encoding", encode_clip),
+        ("disk", lambda: _disk(scratch_of(place) if isinstance(place, str) else place)),
+        ("clip cache", _clip_cache),
+        ("workspace", lambda: _workspace(place)),
+        ("keys", _keys),
+        ("network", check_network),
+    ):
+        yield _finding(what, look)
+
+
+def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
+    """One finding for each requirement of local models: the three families on tiny checkpoints, devices and weights,
+    and what looking into a model takes for granted, of those and of the models of the registry that are named."""
+    from traps_pipeline.mechanism import adapter_checks
+    from traps_pipeline.models.local import selfcheck
+    from traps_pipeline.models.local.adapter import load_local_model
+    from traps_pipeline.models.local.tiny import FAMILIES
+    from traps_pipeline.models.registry import LOCAL, get_model, local_models
+
+    named = [get_model(model) for model in models]
+    for entry in named:
+        if entry.backend != LOCAL:
+            raise TrapsError(
+                f"{entry.id}: runs elsewhere, so nobody looks into it; name one of {', '.join(local_models())}"
+            )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        yield _finding("devices", selfcheck.describe_devices)
+        for family in FAMILIES:
+            yield _finding(family, partial(selfcheck.check_family, family, folder))
+            yield from _inside(family, partial(adapter_checks.tiny_subject, family, folder))
+        yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
+        yield _finding("checkpoints", selfcheck.describe_checkpoints)
+    for entry in named:
+        yield from _inside(
+            entry.id,
+            lambda entry=entry: adapter_checks.Subject(
+                load_local_model(entry, inside=True), *adapter_checks.brightening()
+            ),
+        )
+
+
+def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
+    """One finding for each check of a model; one alone where it cannot be loaded."""
+    from traps_pipeline.mechanism.adapter_checks import CHECKS
+
+    try:
+        subject = load()
+    except Exception as error:  # noqa: BLE001 - whatever the library raises becomes a finding
+        yield Finding(False, name, f"{type(error).__name__}: {error}")
+        return
+    for check in CHECKS:
+        yield _finding(f"{name}, {check.name}", partial(check.found, subject))
+
+
+def examine_files(place: Place) -> Iterator[Finding]:
+    """Every file of a study that says what it must hold, read whole: one finding for each kind."""
+    from traps_pipeline.storage.workspace import Workspace
+
+    workspace = Workspace.open(place)
+    store, lost = workspace.store, list[str]()
+    remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
+    for path in (path for below in remote for path in below):  # fetched, and held against their digests
+        try:
+            store.here(path)
+        except TrapsError as error:
+            lost.append(str(error))
+    for folder in FOLDERS:
+        workspace.bring_folder(workspace.root / folder)
+    if workspace.is_shared:
+        yield Finding(not lost, "store", "; ".join(lost[:SHOWN]) or "every object is what was written")
+    for what, files, damage_of in (
+        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
+        ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
+        ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
+        (
+            "states",
+            sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)),
+            _damaged_states,
+        ),
+        ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
+    ):
+        damaged = [said for path in files if (said := damage_of(path))]
+        shown = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
+        yield Finding(not damaged, what, shown or f"{len(files)} files are what was written")
+    said = [*workspace.answers.damage(), *workspace.votes.damage()]
+    yield Finding(not said, "ledger", "; ".join(said[:SHOWN]) or "all rows are what was written")
+    yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
+
+
+def examine_unused(place: Place, *, is_removed: bool) -> Finding:
+    """The objects in a study's store that nobody names and that are older than the grace period, and which of them were
+    removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be used."""
+    from traps_pipeline.storage.store import GRACE_DAYS
+    from traps_pipeline.storage.workspace import Workspace
+
+    workspace = Workspace.open(place)
+    if not workspace.is_shared:
+        raise TrapsError(
+            f"{place}: a study in a folder has no objects that nobody names; give the address of one in an object "
+            "store with --workspace s3://BUCKET/STUDY"
+        )
+    shown = workspace.store.unused(is_removed=is_removed)
+    what = f"{len(shown)} objects ({sum(one.size for one in shown) / 1e6:.1f} MB)"
+    if shown:
+        what += f", the oldest of {shown[0].at:%Y-%m-%d}: {', '.join(one.name for one in shown[:SHOWN])}"
+        what += ", .." * (len(shown) > SHOWN)
+    done = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
+    return Finding(
+        True, "unused", f"{done}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {what}"
+    )
+
+
+def _damaged_table(path: Path) -> str:
+    from traps_pipeline.storage.parquet import altered
+
+    return altered(path)
+
+
+def _damaged_clip(path: Path) -> str:
+    from traps_pipeline.scenes.worlds.clips import DamagedClip, read_clip
+
+    try:
+        read_clip(path)
+    except DamagedClip as error:
+        return str(error)
+    return ""
+
+
+def _damaged_media(note: Path) -> str:
+    from traps_pipeline.storage.media import payload, read_note
+    from traps_pipeline.video.encode import DamagedClip
+
+    try:
+        media = read_note(note)
+        if media.path is not None:
+            payload(media)
+    except (DamagedClip, ValueError) as error:
+        return str(error)
+    return ""
+
+
+def _damaged_states(path: Path) -> str:
+    from traps_pipeline.mechanism.hidden_states import damage
+
+    return damage(path)
+
+
+def _damaged_history(path: Path) -> str:
+    """A damaged history is no loss: it is put aside and begun anew when the next command opens it."""
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
+            (said,) = opened.execute("pragma quick_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        said = str(error)
+    return "" if said == "ok" else f"{path}: {said}; what counts stands in the tables"
+
+
+def _remove_unfinished(root: Path) -> str:
+    """Remove files that a killed run began and never finished; nothing reads them. A run may be writing young ones."""
+    old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
+    size = sum(path.stat().st_size for path in old)
+    for path in old:
+        path.unlink(missing_ok=True)
+    return f"{len(old)} files of killed runs removed ({size / 1e6:.1f} MB)" if old else "no killed run left a file"
+
+
+def _finding(what: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(True, what, look())
+    except Exception as error:  # noqa: BLE001 - every failure of an examination becomes a finding
+        return Finding(False, what, f"{error}")
+
+
+def _python() -> str:
+    return sys.version.split()[0]
+
+
+def _checkout() -> str:
+    from traps_pipeline.base.paths import require_root
+    from traps_pipeline.benchmark.corrections import read_corrections
+    from traps_pipeline.benchmark.records import load_release, load_released
+    from traps_pipeline.models.registry import load_models
+
+    root, release = require_root(), load_release()
+    counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
+    return f"{root}: {release.name} {release.version}, {counts}"
+
+
+def _disk(root: Path) -> str:
+    return check_disk(root, MIN_FREE_GB)
+
+
+def _clip_cache() -> str:
+    from traps_pipeline.scenes.worlds.clip_cache import VARIABLE, ClipCache
+
+    rendered = ClipCache.of_user()
+    return "off" if rendered is None else f"{rendered.describe()}; {VARIABLE} sets its GB, or off"
+
+
+def _workspace(place: Place) -> str:
+    from traps_pipeline.storage.workspace import Workspace
+
+    if not Workspace.is_there(place):
+        return f"{place} not made yet (`traps init` or `traps run demo` makes it)"
+    study = Workspace.open(place).study
+    return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"
+
+
+def _keys() -> str:
+    """Return the keys that are not set, and the models and judges that need them. The demo needs no key. Raises
+    TrapsError for one that no header can carry."""
+    from traps_pipeline.models.judges import load_judges
+    from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
+
+    entries = [*load_models().values(), *load_judges().values()]
+    for key in sorted({account.key for account in load_accounts().values() if account.key}):
+        optional_key(key)  # raises where it is set to what is no key
+    missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
+    return "; ".join(missing) or "all set"

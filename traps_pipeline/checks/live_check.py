@@ -1,0 +1,400 @@
+"""`traps models check --live`, and the preflight of `traps run`: what would go wrong is said before money is spent.
+
+Each model is asked about a clip that is red and then blue, once with the clip and once without, and in its JSON form;
+each judge votes on answers whose votes are known. What goes wrong is a sentence that names the cause and the remedy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.network import check_network
+from traps_pipeline.base.redaction import redact
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.judging.panel import parse_vote, vote_request
+from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.budget import check_money
+from traps_pipeline.models.judges import JudgeEntry, Task
+from traps_pipeline.models.participants import Row
+from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.reading import degenerate, read_answer
+from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of, effective_params
+from traps_pipeline.models.request import MALFORMED, UNFINISHED, WITH_TEXT, Outcome, Request, TransientError
+from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.storage.media import Media, MediaSpec, MediaStore
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import encode
+
+CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
+TIMEOUT_S = 25.0  # of a call; what is wrong is named within half a minute
+REACH_S = 8.0
+BAD_REQUEST = 400
+COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
+QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
+_FPS, _SIZE, _FRAMES = 10, (160, 120), 50
+_JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
+_ITEM: Mapping[str, Any] = {
+    "item_id": "preflight",
+    "question": "Does the ball roll left or right?",
+    "ground_truth": "left",
+    "answer_type": "direction",
+    "labels": ["left", "right"],
+    "aliases": "{}",
+}
+
+
+@dataclass(frozen=True)
+class Live:
+    """What came of an entry. problems: what keeps its answers from being worth anything; notes: what else was seen."""
+
+    entry: Entry
+    problems: Sequence[str]
+    notes: Sequence[str] = ()
+
+    @property
+    def line(self) -> str:
+        """What came of it, in a line for each finding."""
+        found = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
+        head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
+        return redact("\n".join([head, *(f"     {line}" for line in found)]))
+
+
+# --- what is asked ----------------------------------------------------------------------------------------------------
+
+
+@cache
+def _studio() -> tuple[TemporaryDirectory[str], Path, MediaStore]:
+    folder = TemporaryDirectory(prefix="traps-live-")
+    clip = Path(folder.name) / "clip.mp4"
+    width, height = _SIZE
+    halves = [np.full((height, width, 3), colour, np.uint8) for colour in COLOURS.values()]
+    encode([halves[2 * k // _FRAMES] for k in range(_FRAMES)], clip, _FPS)
+    return folder, clip, MediaStore(Path(folder.name) / "media")
+
+
+def _clip(spec: MediaSpec) -> Media:
+    _, clip, store = _studio()
+    return store.prepare(clip, file_digest(clip), spec)
+
+
+def requests_of(entry: Entry) -> dict[str, Request]:
+    """The calls to an entry, by name. They hold the time: an answer of yesterday says nothing of today."""
+    now = datetime.now(UTC).isoformat()
+    if isinstance(entry, JudgeEntry):
+        tasks: tuple[Task, ...] = ("abstention", "correctness")
+        made = {
+            f"{task} {k}": vote_request(entry, task, CELL, _ITEM, text)
+            for task in tasks
+            for k, (text, abstained, _) in enumerate(_JUDGED)
+            if task == "abstention" or not abstained
+        }
+        return {name: replace(one, about={**one.about, "check": name, "at": now}) for name, one in made.items()}
+    assert isinstance(entry, ModelEntry)
+    sent = _clip(entry.media) if entry.media else None
+    forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
+    if entry.json_schema:
+        forms["schema"] = ("json", sent)
+    return {
+        name: Request(
+            participant=entry.id,
+            endpoint=entry.endpoint,
+            params=effective_params(entry, regime),
+            system=system_prompt(regime),
+            user=QUESTION,
+            about={"check": name, "at": now},
+            sent=media,
+            media_digest=media.sha256 if media else "",
+        )
+        for name, (regime, media) in forms.items()
+    }
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def served_name(entry: Entry) -> str:
+    """The name that a model has at its provider."""
+    return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
+
+
+@dataclass(frozen=True)
+class Reached:
+    """What is found before anything is asked. problem: why asking is of no use; unlisted: that the server's own list of
+    models lacks the name; refused: that the list, which wants nothing but a key, is refused. Neither is certain: some
+    servers list what was downloaded, or examples, and a litellm proxy without a database answers 400 to a wrong key."""
+
+    problem: str = ""
+    unlisted: str = ""
+    refused: str = ""
+
+
+def reach(entry: Entry, account: Account) -> Reached:
+    """Look at the key, the address, and the server's own list of models if it has one."""
+    from traps_pipeline.models.wire import get
+
+    try:
+        check_network()
+        secret = account.secret()
+    except TrapsError as error:
+        return Reached(str(error))
+    if account.base_url is None:
+        return Reached()
+    headers = {"Authorization": f"Bearer {secret}"} if secret else {}
+    try:
+        answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
+    except TrapsError as error:
+        return Reached(nobody_at(account.base_url, plain(str(error))))
+    if answer.status_code in (401, 403):
+        return Reached(_wrong_key(account))
+    if answer.status_code == BAD_REQUEST and account.key:
+        even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
+        return Reached(refused=f"{even}: is the one in {account.key} right?")
+    known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
+    if known and served_name(entry) not in known:
+        listed = plain(", ".join(known[:8]))[:200]
+        return Reached(unlisted=f"{account.base_url} serves no {served_name(entry)!r}; it lists {listed}")
+    return Reached()
+
+
+def nobody_at(address: str, why: str = "the cause stands above") -> str:
+    """The sentence about an address at which nobody answers."""
+    return f"nothing answers at {address} ({why}): start the server there, or mend its `base_url`"
+
+
+def _wrong_key(account: Account) -> str:
+    at = f" at {account.base_url}" if account.base_url else ""
+    said = f"the key in {account.key} is not accepted{at}: export the right one" if account.key else ""
+    return said or f"a key is wanted{at}: name its variable as `key`"
+
+
+def _listed(answer: Any) -> list[Any]:
+    if answer.status_code == 200:
+        with suppress(ValueError, AttributeError):
+            listed = answer.json().get("data")
+            return listed if isinstance(listed, list) else []
+    return []
+
+
+def _answers_to(name: str, outcomes: Mapping[str, Outcome]) -> bool:
+    """Whether somebody answers under that name, which a server may give with a version behind an @."""
+    return any((outcome.served_model or "").partition("@")[0] == name for outcome in outcomes.values())
+
+
+def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
+    """What the outcomes of `requests_of` say of an entry, and what was found before them."""
+    problems, notes, before = list[str](), list[str](), reached or Reached()
+    if before.unlisted and not _answers_to(served_name(entry), outcomes):
+        return Live(entry, [before.unlisted])
+    if before.unlisted:
+        notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
+    if before.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
+        return Live(entry, [before.refused])
+    for name, outcome in outcomes.items():
+        if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
+            continue  # what fails without a schema, too, says nothing of schemas
+        if outcome.kind == "error":
+            slow = outcome.error == "timeout"
+            (notes if slow else problems).append(_failure(entry, account, name, str(outcome.error)))
+        elif outcome.kind == "malformed":
+            odd = "its answer has no shape of its API; what it is stands above"
+            problems.append(f"{name}: {odd if outcome.error in (None, MALFORMED) else outcome.error}")
+        elif outcome.kind == UNFINISHED:
+            problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
+        elif outcome.kind == "refused":
+            why = outcome.finish_reason or f"{outcome.error}; what it said stands above"
+            problems.append(f"{name}: it refuses to answer ({why})")
+    if isinstance(entry, JudgeEntry):
+        problems += _wrong_votes(entry, outcomes)
+    elif isinstance(entry, ModelEntry):
+        problems += [*_wrong_answers(entry, outcomes), *_seen(entry, outcomes, notes)]
+    if entry.prices is None:
+        notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
+    return Live(entry, list(dict.fromkeys(problems)), notes)
+
+
+def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
+    where = account.base_url or entry.endpoint
+    match error:
+        case "unreachable" | "connection":
+            return nobody_at(where)
+        case "http_401" | "http_403":
+            return _wrong_key(account)
+        case "http_403_denied":
+            return f"{name}: {where} refuses the call (HTTP 403), and not for its key; what it said stands above"
+        case "http_404":
+            return f"{where} knows no model {served_name(entry)!r}, or has another path (is /v1 missing?)"
+        case _ if error.startswith("ended_"):
+            return f"{name}: its answer breaks off ({error.removeprefix('ended_')}), which the server's log explains"
+        case "timeout":
+            return f"{name}: no answer within {TIMEOUT_S:.0f} s; a model that thinks for long may need more"
+        case "server_error" if name != "schema":
+            return f"{name}: {where} ends in an error of its own (HTTP 5xx), which the server's log explains"
+        case _ if name == "schema":
+            return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
+        case _:
+            return (
+                f"{name}: it refuses what the entry declares ({error}); what it said stands above. "
+                "`params: {NAME: null}` leaves a parameter out, and a waiver says why"
+            )
+
+
+def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
+    """Return what to declare where an answer shows its thinking between usual marks."""
+    mark = undeclared_mark(split_thinking(outcome.text or "", entry.thinking).answer)
+    return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
+
+
+def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
+    wrong = []
+    for name, outcome in outcomes.items():
+        if outcome.kind not in (*WITH_TEXT, "empty"):
+            continue
+        task: Task = "abstention" if name.startswith("abstention") else "correctness"
+        _, abstained, correct = _JUDGED[int(name[-1])]
+        vote = parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, _ITEM, entry.thinking)
+        if not vote.valid:
+            invalid = f"its vote on {task} does not meet the schema ({vote.invalid_reason})"
+            wrong.append(_undeclared_thinking(entry, outcome) or invalid)
+        elif vote.decision is not (abstained if task == "abstention" else correct):
+            wrong.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
+    return wrong
+
+
+def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
+    wrong = []
+    for name, outcome in outcomes.items():
+        text = outcome.text or ""
+        if outcome.kind == "empty":
+            wrong.append(f"{name}: its answer is empty (finish reason {outcome.finish_reason})")
+        if outcome.kind not in WITH_TEXT:
+            continue
+        if marked := _undeclared_thinking(entry, outcome):
+            wrong.append(marked)
+            continue
+        row = {"outcome": outcome.kind, "text": text}
+        read = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
+        if read.outcome == "degenerate":
+            wrong.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
+        elif read.is_json is False and read.outcome == "answer":
+            wrong.append(
+                "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and "
+                "why under waivers"
+            )
+    return wrong
+
+
+def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
+    """Whether the clip arrives: its two colours are named, or its tokens are counted."""
+    clip, blank = outcomes.get("clip"), outcomes.get("no clip")
+    if clip is None or blank is None or clip.kind not in WITH_TEXT:
+        return []
+    named = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
+    counted = None
+    if clip.prompt_tokens is not None and blank.prompt_tokens is not None:
+        counted = clip.prompt_tokens - blank.prompt_tokens
+    if counted is not None and counted <= 0:
+        return [
+            f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; "
+            f"is this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
+        ]
+    if not named and counted is None:
+        return ["it does not see the clip: it names no colour of one that is red and then blue, nor counts its tokens"]
+    if not named:
+        notes.append(f"it counts {counted} tokens for the clip, and does not name its colours (red, then blue)")
+    return []
+
+
+# --- asking -----------------------------------------------------------------------------------------------------------
+
+
+def check_live(entries: Iterable[Entry]) -> list[Live]:
+    """Ask these entries, side by side, without a study: what it costs is booked nowhere."""
+
+    async def every() -> list[Live]:
+        return list(await asyncio.gather(*(one(entry) for entry in entries)))
+
+    async def one(entry: Entry) -> Live:
+        account = account_of(entry)
+        reached = await asyncio.to_thread(reach, entry, account)
+        if reached.problem:
+            return Live(entry, [reached.problem])
+        backend = make_backend(entry)
+
+        async def asked(request: Request) -> Outcome:
+            try:
+                async with asyncio.timeout(TIMEOUT_S):
+                    return await backend.ask(request)
+            except TransientError as error:
+                return replace(error.outcome, error=error.why or error.kind)
+            except TimeoutError:
+                return Outcome("error", error="timeout")
+
+        requests = requests_of(entry)
+        outcomes = await asyncio.gather(*map(asked, requests.values()))
+        return findings(entry, account, dict(zip(requests, outcomes, strict=True)), reached)
+
+    return asyncio.run(every())
+
+
+def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[Live]:
+    """Look at prices, then ask the models and judges of a run, under its budget; the calls are in the ledger of votes.
+
+    Raises TrapsError where the study does not allow what somebody costs: judges are looked at before a model is asked.
+    """
+    entries = [entry for entry in (*models, *judges) if entry.backend == NETWORK]
+    for entry in entries:
+        check_money(workspace.study, entry)
+    accounts = {entry.id: account_of(entry) for entry in entries}
+    reached = {entry.id: reach(entry, accounts[entry.id]) for entry in entries}
+    quick = {
+        entry.id: entry.model_copy(
+            update={"limits": entry.limits.model_copy(update={"retries": 1, "timeout_s": TIMEOUT_S / 2})}
+        )
+        for entry in entries
+        if not reached[entry.id].problem
+    }
+    requests = {name: requests_of(entry) for name, entry in quick.items()}
+    calls = [Call(request) for of_one in requests.values() for request in of_one.values()]
+    outcomes: Mapping[str, Outcome] = {}
+    if calls:
+
+        def finish(settled: Settled[Cell, Call]) -> Mapping[str, Outcome]:
+            return {key: _outcome(row) for key, row in settled.rows.items()}
+
+        (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
+    found = []
+    for entry in entries:
+        if problem := reached[entry.id].problem:
+            found.append(Live(entry, [problem]))
+        else:
+            mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
+            found.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
+    return found
+
+
+def _outcome(row: Row) -> Outcome:
+    names = ("text", "finish_reason", "error", "prompt_tokens", "served_model")
+    return Outcome(row["outcome"], **{name: row.get(name) for name in names})
+
+
+def require_sound(found: Sequence[Live]) -> None:
+    """Raises TrapsError that names everything that is wrong with anybody."""
+    wrong = [f"{one.entry.id}: {problem}" for one in found for problem in one.problems]
+    if wrong:
+        more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
+        raise TrapsError("\n".join([*wrong, more]))

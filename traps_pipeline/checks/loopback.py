@@ -1,0 +1,117 @@
+"""A fake provider on this machine: an entry's backend sends its requests there, and the requests are recorded."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import repeat
+from threading import Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+from traps_pipeline.base.progress import Progress, reporting
+from traps_pipeline.checks.wire_body import WireBody
+from traps_pipeline.models.api import ApiBackend
+from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.models.transport import watching
+
+PLACEHOLDER_KEY = "placeholder-of-a-key"
+
+
+class _Loopback(Account):
+    """An account whose provider is this machine."""
+
+    def secret(self) -> str | None:
+        """A placeholder for the key."""
+        return PLACEHOLDER_KEY
+
+
+@dataclass
+class _Notes(Progress):
+    """Keeps the notes of a backend, such as the reason why a client library refused to send."""
+
+    texts: list[str] = field(default_factory=list)
+
+    def note(self, text: str) -> None:
+        """See `Progress.note`."""
+        self.texts.append(text)
+
+
+_CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error", "code": 400}}')
+
+
+@contextmanager
+def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
+    """A server on this machine: its address and the requests that reach it. Each gets the next of these answers, a
+    status and JSON, or a final 400."""
+    caught: list[WireBody] = []
+    given = repeat(_CAUGHT) if answers is None else answers
+
+    class Catcher(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            raw = self.rfile.read(int(self.headers.get("content-length") or 0))
+            caught.append(WireBody(self.command, self.path, dict(self.headers), raw))
+            status, answer = next(given, _CAUGHT)
+            self.send_response(status)
+            self.send_header("content-type", "application/json")
+            self.send_header("content-length", str(len(answer)))
+            self.end_headers()
+            self.wfile.write(answer)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Catcher)
+    Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}", caught
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
+    """The outcome of each request if its provider answered it with this status and JSON."""
+    account = load_accounts()[str(entry.account)]
+    with _listening(iter(answers)) as (address, _), reporting(_Notes()):
+        loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
+        backend = ApiBackend(entry, loopback)
+
+        async def read(request: Request) -> Outcome:
+            try:
+                return await backend.ask(request)
+            except TransientError as error:
+                return error.outcome
+
+        async def read_all() -> list[Outcome]:
+            return [await read(request) for request in requests]  # one after the other: answers come in order
+
+        return asyncio.run(read_all())
+
+
+def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
+    """The body of each request, or why none was sent."""
+    account, notes = load_accounts()[str(entry.account)], _Notes()
+    with _listening() as (address, caught), reporting(notes):
+        loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
+
+        async def ask_all() -> list[WireBody | str]:
+            return [await _ask(entry, loopback, request, caught, notes) for request in requests]
+
+        return asyncio.run(ask_all())
+
+
+async def _ask(
+    entry: Entry, account: Account, request: Request, caught: list[WireBody], notes: _Notes
+) -> WireBody | str:
+    caught.clear()
+    backend = ApiBackend(entry, account)  # a new one for each call, because it notes each kind of failure only once
+    with watching() as exchange, suppress(TransientError):
+        await backend.ask(request)
+    if caught and not exchange.sent:
+        return "the request went over a connection that is not watched, so that nobody knows what is billed"
+    return caught[0] if len(caught) == 1 else f"{len(caught)} requests were sent, not one ({notes.texts[-1:]})"

@@ -1,0 +1,299 @@
+"""`traps models check` compares the request that an entry of the registry sends with the request that it declares.
+
+Client libraries rename, add and drop fields without a warning. So each entry is asked one question through the backend
+that studies use, the request is recorded on this machine, and its body must consist of prompt, clip, question, declared
+parameters, and nothing else. No key is needed, and nothing leaves the machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
+from traps_pipeline.checks.wire_body import (
+    ENDPOINTS,
+    SCHEMAS,
+    UNKNOWN_FORM,
+    ClipPart,
+    WireBody,
+    declared_fields,
+    flat,
+    read_body,
+)
+from traps_pipeline.judging.confabulation import label_request, load_protocol
+from traps_pipeline.judging.panel import tasks_for, vote_request
+from traps_pipeline.models.judges import JudgeEntry, load_judges
+from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, effective_params, load_models
+from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, sample
+from traps_pipeline.video.encode import encode
+
+_MIMES = {"video": "video/mp4", "images": "image/jpeg"}
+_QUESTION = 'Does the square stop at the right edge, "yes" or "no"? (1 % of clips: déjà vu)'
+_CLIP_FPS, _CLIP_FRAMES, _CLIP_SIZE = 10, 50, (480, 360)
+_PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
+
+
+# --- the question that is asked ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Studio:
+    """A clip without a scene, in a folder that exists until this process ends."""
+
+    folder: TemporaryDirectory[str]
+    clip: Path
+    media: MediaStore
+
+    def prepare(self, spec: MediaSpec) -> Media:
+        return self.media.prepare(self.clip, file_digest(self.clip), spec)
+
+
+@cache
+def _studio() -> _Studio:
+    folder = TemporaryDirectory(prefix="traps-wire-")
+    clip = Path(folder.name) / "clip.mp4"
+    encode(_frames(), clip, _CLIP_FPS)
+    return _Studio(folder, clip, MediaStore(Path(folder.name) / "media"))
+
+
+def _frames() -> list[np.ndarray]:
+    """Frames of a square that moves over a gradient."""
+    width, height = _CLIP_SIZE
+    ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
+    frames = []
+    for i in range(_CLIP_FRAMES):
+        frame = ground.copy()
+        frame[150:210, 8 * i : 8 * i + 60] = (220, 40, 40)
+        frames.append(frame)
+    return frames
+
+
+def requests_of(entry: Entry) -> dict[str, Request]:
+    """One request of every form that a study sends to an entry: for a model by regime, for a judge by task (and a label
+    of confabulation, if the judge labels it)."""
+    if isinstance(entry, ModelEntry):
+        return {regime: _answer_request(entry, regime) for regime in REGIMES}
+    assert isinstance(entry, JudgeEntry)
+    votes = {str(task): _vote_request(entry, task) for task in tasks_for("control")}
+    return votes | ({"confabulation": _label_request(entry)} if entry.id in load_protocol().judges.values() else {})
+
+
+def _answer_request(entry: ModelEntry, regime: str) -> Request:
+    sent = _studio().prepare(entry.media) if entry.media else None
+    return Request(
+        participant=entry.id,
+        endpoint=entry.endpoint,
+        params=effective_params(entry, regime),
+        system=system_prompt(regime),
+        user=_QUESTION,
+        about={"regime": regime},
+        sent=sent,
+        media_digest=sent.sha256 if sent else "",
+    )
+
+
+def _label_request(entry: JudgeEntry) -> Request:
+    cell = Cell("occlusion", Evaluation("oracle", "standard", 1))
+    return label_request(entry, cell, {"item_id": "none", "question": _QUESTION}, "Yes.", "Perhaps.")
+
+
+def _vote_request(entry: JudgeEntry, task: Literal["abstention", "correctness"]) -> Request:
+    cell = Cell("occlusion", Evaluation("oracle", "standard", 1))
+    return vote_request(entry, task, cell, {"item_id": "none", "question": _QUESTION, "ground_truth": "yes"}, "Yes.")
+
+
+# --- comparing the sent with the declared request ---------------------------------------------------------------------
+
+
+def _field_problems(declared: Mapping[str, Any], sent: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in declared.items():
+        if name not in sent:
+            yield f"{name}: {_short(value)} is declared and not sent"
+        elif sent[name] != value:
+            yield f"{name}: {_short(value)} is declared, {_short(sent[name])} is sent"
+    for name in sent.keys() - declared.keys():
+        yield f"{name}: {_short(sent[name])} is sent and not declared"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
+    """The problems of the turns: system prompt and question must arrive verbatim, with the clip before the question and
+    nothing else."""
+    roles = [role for role, _ in turns]
+    if roles != ["system", "user"]:
+        yield f"the turns are {roles}, not system and user"
+        return
+    (_, system), (_, user) = turns
+    if system != [request.system]:
+        yield "the system prompt does not arrive verbatim"
+    if not user or user[-1] != request.user:
+        yield "the question does not arrive verbatim, as the last part"
+    clips = [part for part in user if isinstance(part, ClipPart)]
+    if len(clips) != len(user) - 1:
+        yield "something other than clip and question arrives"
+    if request.sent is not None:
+        yield from _clip_problems(clips, request.sent)
+
+
+def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
+    wanted = media.n_frames if media.profile == "images" else 1
+    if len(clips) != wanted:
+        yield f"media: {len(clips)} of {wanted} {'images' if media.profile == 'images' else 'videos'} arrive"
+        return
+    found = hashlib.sha256()
+    for clip in clips:
+        found.update(clip.data)
+    if found.hexdigest() != media.sha256:
+        yield "media: the bytes that arrive are not those that were prepared"
+    for name, seen, declared in (
+        ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
+        ("fps", {clip.fps for clip in clips}, media.fps),
+    ):
+        if seen != {declared}:
+            yield f"media.{name}: {declared} is declared, {', '.join(map(str, seen))} arrives"
+
+
+def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[str]:
+    if wire.api is None:
+        yield f"{wire.method} {wire.path} belongs to no API that can be checked ({', '.join(ENDPOINTS)})"
+        return
+    if PLACEHOLDER_KEY.encode() in wire.raw or PLACEHOLDER_KEY in wire.path:
+        yield "the API key is in the body or the address"
+    if not any(PLACEHOLDER_KEY in value for value in wire.headers.values()):
+        yield "the API key is in no header"
+    try:
+        body = read_body(wire)
+    except UNKNOWN_FORM as error:
+        yield f"the body has an unknown form ({type(error).__name__}: {error})"
+        return
+    if body.model != model_name(entry):
+        yield f"model: {model_name(entry)} is declared, {body.model} is sent"
+    yield from _turn_problems(body.turns, request)
+    yield from _field_problems(declared_fields(wire.api, request.params), body.fields)
+
+
+def model_name(entry: Entry) -> str:
+    """The provider's own name of a model: litellm's name without the route."""
+    return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
+
+
+# --- entries ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Checked:
+    """An entry, a line about its request, and the problems of the request."""
+
+    entry: Entry
+    line: str
+    problems: list[str]
+
+
+def examine(entry: Entry) -> Checked:
+    """Send the requests of an entry to this machine and compare them."""
+    if entry.backend == NETWORK:
+        return _examine_network(entry)
+    if isinstance(entry, ModelEntry) and entry.media is not None:
+        return _examine_local(entry, entry.media)
+    return Checked(entry, f"{entry.id:<24} nothing is sent anywhere", [])
+
+
+def _examine_network(entry: Entry) -> Checked:
+    requests = requests_of(entry)
+    bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
+    problems: dict[str, list[str]] = {}
+    for form, body in bodies.items():
+        found = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
+        for problem in found:
+            problems.setdefault(problem, []).append(form)
+    listed = [p if len(forms) == len(bodies) else f"{' and '.join(forms)}: {p}" for p, forms in problems.items()]
+    if isinstance(entry, ModelEntry):
+        listed += _protocol_problems(entry, requests)
+    first = next(iter(requests))
+    return Checked(entry, _line(entry, bodies[first], requests[first].sent), listed)
+
+
+def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
+    """Departures from the protocol, which holds for every model in addition to its entry."""
+    for regime, request in requests.items():
+        if ("response_format" in request.params) != (entry.json_schema and regime == "json"):
+            yield f"{regime}: structured output is for the JSON regime alone, where the entry has json_schema"
+    shown = {request.sent.n_frames for request in requests.values() if request.sent}
+    if "media" not in entry.waivers and shown != {_PROTOCOL_FRAMES}:
+        yield f"media: {shown} frames of a 5 s clip are sent, the protocol has {_PROTOCOL_FRAMES} (5 a second)"
+
+
+def _line(entry: Entry, wire: WireBody | str, media: Media | None) -> str:
+    if isinstance(wire, str):
+        return f"{entry.id:<24} nothing caught"
+    shown = f"{media.profile} {media.n_frames} frames {media.size_bytes:,} bytes" if media else "no clip"
+    try:
+        fields = read_body(wire).fields
+    except UNKNOWN_FORM:
+        fields = {}
+    return f"{entry.id:<24} {wire.path}  {shown}  {_fields(fields)}"
+
+
+def _fields(fields: Mapping[str, Any]) -> str:
+    shown = {name: "schema" if name in SCHEMAS else _short(value) for name, value in fields.items()}
+    return " ".join(f"{name.removeprefix('generationConfig.')}={value}" for name, value in shown.items())
+
+
+def _examine_local(entry: ModelEntry, spec: MediaSpec) -> Checked:
+    """Check the frames that a local model is shown: nothing is sent, but frames are picked and resized."""
+    shown = sample(_studio().clip, spec)
+    count, (height, width) = len(shown.frames), shown.frames.shape[1:3]
+    times = " ".join(f"{time:g}" for time in shown.times_s[:3])
+    line = f"{entry.id:<24} local  {count} frames of {width} x {height} at {times} ... {shown.times_s[-1]:g} s"
+    problems = list(_local_problems(shown.times_s, (width, height), spec))
+    return Checked(entry, f"{line}  {_fields(flat(entry.params))}", problems)
+
+
+def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec) -> Iterator[str]:
+    last = (_CLIP_FRAMES - 1) / _CLIP_FPS
+    if spec.uniform is not None:
+        wanted = np.linspace(0, last, min(spec.uniform, _CLIP_FRAMES))
+    else:
+        wanted = (np.arange(_CLIP_FRAMES) / (spec.fps or 1))[: spec.most]
+        wanted = wanted[wanted <= last + 1e-6]
+    if len(times_s) != len(wanted):
+        yield f"media: {len(times_s)} frames are shown, {len(wanted)} are declared"
+    elif np.abs(times_s - wanted).max() > 0.5 / _CLIP_FPS + 1e-6:
+        yield "media: the frames are not those nearest to the declared times"
+    if size != (spec.size or _CLIP_SIZE):
+        yield f"media: frames are {size}, {spec.size or _CLIP_SIZE} is declared"
+
+
+def participants() -> dict[str, Entry]:
+    """Models and judges that are asked over the network or locally, by id."""
+    return {**load_models(), **load_judges()}
+
+
+def check_named(names: Sequence[str]) -> Iterator[Checked]:
+    """Check the entries with these ids; without any ids, all entries that send or show something. Raises TrapsError for
+    an unknown id."""
+    known = participants()
+    if unknown := [name for name in names if name not in known]:
+        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")
+    for name, entry in known.items():
+        if name in names or (not names and entry.backend in (NETWORK, "local")):
+            yield examine(entry)

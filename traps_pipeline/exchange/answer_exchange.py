@@ -1,0 +1,378 @@
+"""Answers from elsewhere: from a cluster, or from a provider's batch mode.
+
+`export_requests` writes the missing requests as JSON lines, with their media by digest; `import_answers` reads answers
+with the same keys and makes the same checks. Both files are data: nothing in them is executed or used unchecked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing, write_bytes
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.yamlfile import explain, read_lines
+from traps_pipeline.benchmark.held_out import opaque
+from traps_pipeline.exchange.batch import export_batches, failures, is_batch, outcomes_of, read_batch
+from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, Given, reader_of
+from traps_pipeline.judging.panel import wanted_ballots
+from traps_pipeline.ledger.ledger import Ledger
+from traps_pipeline.ledger.rows import MOST_TOKENS, Stored
+from traps_pipeline.models.answers import prepare_media, wanted_questions
+from traps_pipeline.models.endings import ending_of
+from traps_pipeline.models.judges import load_judges, load_panel
+from traps_pipeline.models.participants import ledger_row
+from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
+from traps_pipeline.models.request import UNFINISHED, WITH_TEXT, Outcome, OutcomeKind, Request
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.pipeline.experiment import Experiment
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.workspace import Workspace
+
+REQUESTS, MEDIA = "requests.jsonl", "media"
+# How a text begins that a harness put in the place of an answer when its call failed.
+_ERROR_TEXT = re.compile(
+    r"\W*(?:(?:\w+\.)*(?:\w*error|\w*exception)\b\s*(?:code)?\s*[:(\[\d-]|traceback \(most recent|an error occurred"
+    r"|(?:\w+\.)+exceptions?\.\w+\b"
+    r"|(?:http|status|code)\W*[45]\d\d\b|[45]\d\d (?:client|server) error|too many requests|rate limit"
+    r"|internal server error|service unavailable"
+    r"|bad gateway|gateway time-?out|(?:request|connection|read) (?:failed|error|refused|reset|timed out))",
+    re.IGNORECASE,
+)
+MOST_LOOKED_AT = 200  # characters of a text
+SHOWN = 5  # number of wrong lines that an error names
+
+
+class Answer(BaseModel):
+    """One line of a file of answers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    key: str
+    outcome: OutcomeKind = "answer"
+    text: str | None = None
+    reasoning: str | None = None
+    finish_reason: str | None = None
+    served_model: str | None = None
+    prompt_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    completion_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    reasoning_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    latency_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _outcome_follows_the_reason(cls, data: Any) -> Any:
+        """Take the outcome of a line that gives none from its finish reason: half a sentence is no answer."""
+        if isinstance(data, dict) and "outcome" not in data and isinstance(data.get("finish_reason"), str):
+            return data | {"outcome": OUTCOMES.get(ending_of(data["finish_reason"]), UNFINISHED)}
+        return data
+
+    @model_validator(mode="after")
+    def _text_goes_with_outcome(self) -> Answer:
+        if self.outcome in ("error", "malformed"):
+            raise ValueError("outcome: an error is no answer; remove the line, so that the item stays missing")
+        has_text = self.outcome in (*WITH_TEXT, UNFINISHED)
+        if has_text != bool((self.text or "").strip()):
+            needs = "needs a text" if has_text else "must have no text"
+            raise ValueError(f"text: outcome {self.outcome!r} {needs}")
+        return self
+
+    def as_outcome(self, entry: ModelEntry) -> Outcome:
+        """The outcome of the request, with its price from the registry."""
+        fields = self.model_dump(exclude={"key", "outcome", "latency_s"})
+        cost = None
+        if entry.prices and self.prompt_tokens is not None and self.completion_tokens is not None:
+            cost = entry.prices.cost(self.prompt_tokens, self.completion_tokens)
+        return Outcome(self.outcome, **fields, cost_usd=cost)
+
+
+@dataclass(frozen=True)
+class Imported:
+    """The result of an import: the numbers of new answers, and of answers that the ledger had already; the calls that
+    failed, in words, which stay missing; the number of error messages that were left out."""
+
+    new: int
+    known: int
+    failed: str = ""
+    dropped: int = 0
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What came of a request, with the seconds that it took."""
+
+    request: Request
+    outcome: Outcome
+    latency_s: float
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """The evaluation in whose ledger it stands."""
+        about = self.request.about
+        return Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))
+
+
+def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
+    """Write the experiment's missing requests to `out` (requests.jsonl, and media/<sha256>.<suffix>); returns their
+    number.
+
+    A line holds key, model, provider_id, params, system, user, about (item, model, regime, run) and media: profile,
+    file, sha256, n_frames, times_s (s), fps. A local model's media is the clip itself: decode the frames at times_s.
+    Raises TrapsError when items are missing or `out` already holds an export.
+    """
+    if (out / REQUESTS).exists():
+        raise TrapsError(f"{out / REQUESTS} exists already; give another folder, or delete it")
+    (out / MEDIA).mkdir(parents=True, exist_ok=True)
+    prepare_media(workspace, _cells(workspace, experiment))
+    count = 0
+    with replacing(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
+        for request in _missing(workspace, experiment):
+            stream.write(json.dumps(_line(request, out), ensure_ascii=False) + "\n")
+            count += 1
+    return count
+
+
+def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
+    """The experiment's cells whose datasets have items; a study of one taxonomy has two of four. Raises TrapsError if
+    there is none."""
+    cells = [cell for cell in experiment.cells() if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
+    if not cells:
+        raise TrapsError(f"{workspace.root}: no items yet; materialize scene_specs, videos and items first")
+    return cells
+
+
+def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
+    known: dict[Evaluation, set[str]] = {}
+    for cell in _cells(workspace, experiment):
+        evaluation = cell.evaluation
+        if evaluation not in known:
+            known[evaluation] = {*workspace.answers.read(evaluation.key).settled}
+        wanted = (question.request for question in wanted_questions(workspace, cell))
+        yield from (request for request in wanted if request.key not in known[evaluation])
+
+
+def _line(request: Request, out: Path) -> dict[str, Any]:
+    media: dict[str, Any] | None = None
+    if request.sent is not None and request.media is not None:
+        source = request.sent.path or request.media
+        file = out / MEDIA / f"{request.sent.sha256}{source.suffix}"
+        if not file.exists():
+            write_bytes(file, source.read_bytes())
+        sent = request.sent
+        media = {"profile": sent.profile, "file": f"{MEDIA}/{file.name}", "sha256": sent.sha256}
+        media |= {"n_frames": sent.n_frames, "times_s": list(sent.times_s), "fps": sent.fps}
+    return {
+        "key": request.key,
+        "model": request.participant,
+        "provider_id": request.endpoint,
+        "params": dict(request.params),
+        "system": request.system,
+        "user": request.user,
+        "about": dict(request.about),
+        "media": media,
+    }
+
+
+@dataclass(frozen=True)
+class Whose:
+    """What a file of answers by item does not say: which model of the experiment answered (None: its only one), in
+    which run, and the key of the held-out set whose opaque names it has."""
+
+    model: str | None = None
+    run: int = 1
+    key: bytes | None = None
+
+
+def import_answers(
+    workspace: Workspace,
+    experiment: Experiment,
+    path: Path,
+    whose: Whose | None = None,
+    errors: Literal["drop", "keep"] | None = None,
+) -> Imported:
+    """Import answers (JSON lines, see `Answer`; or by item, see `exchange.harness_logs`) into the ledger; `traps run`
+    then makes tables from them.
+
+    All lines are checked before any is written. Raises TrapsError naming lines that are not answers, that have a key
+    outside the experiment (another question, clip, parameter or run), or that answer a key a second time differently;
+    and for a file without answers.
+
+    errors: whether texts that look like error messages are left out or are answers; TrapsError shows them where it is
+    not said.
+    """
+    cells = _cells(workspace, experiment)
+    prepare_media(workspace, cells)
+    requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
+    wanted = {request.key: request for request in requests}
+    if path.suffix != LOG and is_batch(path):
+        return _import_batch(workspace, workspace.answers, load_models(), wanted, path)
+    reader = reader_of(path)
+    answers, n_failed = (
+        (checked_answers(path, wanted), 0) if reader is None else _by_item(reader(path), wanted, whose or Whose())
+    )
+    if not answers:
+        raise TrapsError(f"{path}: holds no answers; nothing was imported")
+    like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
+    if like_errors and errors is None:
+        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, wanted))
+    for key in like_errors if errors == "drop" else ():
+        del answers[key]
+    found = [
+        _Stored(wanted[key], answer.as_outcome(get_model(wanted[key].participant)), answer.latency_s)
+        for key, answer in answers.items()
+    ]
+    new = asyncio.run(_store(workspace, workspace.answers, found))
+    failed = f"{n_failed} samples of the log" if n_failed else ""
+    return Imported(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
+
+
+def _said_of_errors(path: Path, answers: Mapping[str, Answer], wanted: Mapping[str, Request]) -> str:
+    """Return how many texts look like error messages, some of them, and what to do."""
+    shown = [f"{wanted[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
+    return (
+        f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(shown)}): say "
+        "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
+    )
+
+
+def export_request_batches(
+    workspace: Workspace, experiment: Experiment, out: Path, media_at: str | None = None
+) -> tuple[list[Path], int]:
+    """Write the experiment's missing requests as the providers' batch files (`exchange.batch.export_batches`); return
+    the files and the number of calls."""
+    prepare_media(workspace, _cells(workspace, experiment))
+    missing: dict[str, list[Request]] = {}
+    for request in _missing(workspace, experiment):
+        missing.setdefault(request.participant, []).append(request)
+    return export_batches({name: (get_model(name), requests) for name, requests in missing.items()}, out, media_at)
+
+
+def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:
+    """Write the votes that are missing on the experiment's answers as the judges' batch files; the files, and the
+    number of calls. Raises TrapsError where answers are missing."""
+    missing: dict[str, list[Request]] = {}
+    known: dict[Evaluation, set[str]] = {}
+    for cell, request in _wanted_votes(workspace, experiment):
+        if cell.evaluation not in known:
+            known[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
+        if request.key not in known[cell.evaluation]:
+            missing.setdefault(request.participant, []).append(request)
+    judges = load_judges()
+    return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)
+
+
+def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
+    """Import a batch of votes into their ledger; `traps run` then makes tables from them. Raises TrapsError as
+    `import_answers` does."""
+    wanted = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
+    return _import_batch(workspace, workspace.votes, load_judges(), wanted, path)
+
+
+def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tuple[Cell, Request]]:
+    panel = load_panel(workspace.study.panel)
+    cells = [cell for cell in _cells(workspace, experiment) if workspace.tables.state(RESPONSES, cell.partition)]
+    if not cells:
+        raise TrapsError(f"{workspace.root}: no answers yet; make responses first (traps run ... --until responses)")
+    for cell in cells:
+        yield from ((cell, ballot.request) for ballot in wanted_ballots(workspace, panel, cell))
+
+
+def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
+    outcome = replace(outcome, client=None)  # what built the call is not known: another version may have exported it
+    if outcome.cost_usd is None:
+        return outcome
+    return replace(outcome, cost_usd=outcome.cost_usd * account_of(entry).batch_price)
+
+
+def _import_batch(
+    workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], wanted: Mapping[str, Request], path: Path
+) -> Imported:
+    returned = read_batch(path, wanted)
+    if not returned:
+        raise TrapsError(f"{path}: holds no answers; nothing was imported")
+    found = [
+        _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
+        for request, outcome in outcomes_of(entries, wanted, returned)
+    ]
+    new = asyncio.run(_store(workspace, ledger, found))
+    failed = sum(one.outcome.kind in ("error", "malformed") for one in found)
+    return Imported(new, len(found) - new - failed, failures([one.outcome for one in found]))
+
+
+def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
+    """The answers of a file by key. Raises TrapsError naming the lines (up to five) that are wrong or not wanted."""
+    answers: dict[str, Answer] = {}
+    wrong: list[str] = []
+    for number, line in read_lines(path):
+        try:
+            answer = Answer.model_validate(json.loads(line))
+        except ValidationError as error:
+            wrong.append(f"{path}:{number}: {explain(error, Answer)}")
+            continue
+        except (ValueError, RecursionError) as error:
+            wrong.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
+            continue
+        if answer.key not in wanted:
+            wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
+        elif answers.setdefault(answer.key, answer) != answer:
+            wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
+    if wrong:
+        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
+    return answers
+
+
+def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose) -> tuple[dict[str, Answer], int]:
+    """Return the answers of a harness by key, and the number of calls that failed in it and have no answer elsewhere.
+
+    Epochs of a harness are runs from `whose.run` on. Raises TrapsError naming those (up to five) that are wrong or not
+    wanted.
+    """
+    models = sorted({request.participant for request in wanted.values()})
+    model = whose.model or (models[0] if len(models) == 1 else None)
+    if model not in models:
+        raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
+    keys = {
+        (str(at["item_id"]), str(at["regime"]), int(at["run"])): key
+        for key, request in wanted.items()
+        if (at := request.about)["model"] == model
+    }
+    names = {opaque(whose.key, item): item for item, _, _ in keys} if whose.key else {}
+    answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
+    for one in given:
+        run = whose.run + one.epoch - 1 if one.run is None else one.run
+        key = keys.get((names.get(one.item, one.item), one.regime, run))
+        try:
+            if key is None:
+                wrong.append(f"{one.where}: {one.item} under {one.regime}, run {run}, is not wanted of {model}")
+            elif one.has_failed:
+                failed.add(key)
+            elif answers.setdefault(key, answer := Answer(key=key, **one.answer)) != answer:
+                wrong.append(f"{one.where}: gives another answer to {one.item} than an earlier one")
+        except ValidationError as error:
+            wrong.append(f"{one.where}: {explain(error)}")
+        except TypeError as error:
+            wrong.append(f"{one.where}: {plain(error)[:200]}")
+    if wrong:
+        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise TrapsError("\n".join(map(plain, wrong[:SHOWN])) + more + "\nnothing was imported")
+    return answers, len(failed - answers.keys())
+
+
+async def _store(workspace: Workspace, ledger: Ledger, found: Sequence[_Stored]) -> int:
+    """Store what the ledger does not hold, all of it or nothing; the number of new answers. A failed call is stored,
+    too, and is asked again."""
+    rows: dict[str, list[Stored]] = {}
+    for one in sorted(found, key=lambda one: one.evaluation):
+        row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
+        rows.setdefault(one.evaluation.key, []).append(row)
+    return await ledger.store(rows, progress.current().note)

@@ -1,0 +1,232 @@
+"""Calls as the providers' own batch files, and the answers that come back in theirs (docs/models.md, "Batches").
+
+A body is written as the live call would send it: the entry's backend sends it to this machine, where it is recorded. An
+answer is read as the live call would read it: the backend gets it from this machine, with the status that the provider
+gave it. So both ways make the same rows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.yamlfile import read_lines
+from traps_pipeline.checks.loopback import render, replay
+from traps_pipeline.checks.wire_body import Api, WireBody
+from traps_pipeline.exchange.media_references import FOLDER as MEDIA
+from traps_pipeline.exchange.media_references import References
+from traps_pipeline.models.registry import Entry
+from traps_pipeline.models.request import Outcome, Request
+
+FOLDER = "batches"
+AT_ONCE = 200  # bodies in memory
+# The most calls and bytes of a file, as the providers publish them; vLLM's run-batch reads OpenAI's form.
+LIMITS: Mapping[Api, tuple[int, int]] = {
+    "chat": (50_000, 190 * 2**20),
+    "responses": (50_000, 190 * 2**20),
+    "gemini": (50_000, 1900 * 2**20),
+    "anthropic": (100_000, 240 * 2**20),
+}
+SHOWN = 5
+FAILED = 400  # statuses from here on are failures
+
+
+Item = TypeVar("Item")
+
+
+def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
+    """The items in lists of at most AT_ONCE."""
+    rest = iter(items)
+    while some := list(islice(rest, AT_ONCE)):
+        yield some
+
+
+# --- export -----------------------------------------------------------------------------------------------------------
+
+
+def export_batches(
+    calls: Mapping[str, tuple[Entry, Iterable[Request]]], out: Path, media_at: str | None = None
+) -> tuple[list[Path], int]:
+    """Write the calls of each participant to files below `out`, split where the provider's limits want it; the files
+    and the number of calls. media_at: the address under which the folder `media` of `out` will be found, to which the
+    bodies then refer; without it media are inline. Raises TrapsError where a call cannot be made, or where files are
+    there already."""
+    if here := [name for name, (entry, _) in calls.items() if entry.account is None]:
+        raise TrapsError(
+            f"{', '.join(here[:5])}{' and others are' if len(here) > 5 else ' are' if len(here) > 1 else ' is'} asked "
+            "here, and only a provider takes batches: leave --batch out, or take experiment and panel of others"
+        )
+    folder = out / FOLDER
+    if folder.exists() and any(folder.iterdir()):
+        raise TrapsError(f"{folder} holds batches already; give another folder, or delete it")
+    folder.mkdir(parents=True, exist_ok=True)
+    files, count = list[Path](), 0
+    references = References(out / MEDIA, media_at) if media_at else None
+    for name, (entry, requests) in calls.items():
+        part = _Part(folder, name)
+        for some in _some(requests):
+            for request, wire in zip(some, render(entry, some), strict=True):
+                if isinstance(wire, str) or wire.api is None:
+                    raise TrapsError(
+                        f"{name}: no batch can be made of its calls: {wire if isinstance(wire, str) else wire.path}"
+                    )
+                body = references.instead_of(wire.body) if references else wire.body
+                part.add(wire.api, line_of(request.key, wire, body))
+                count += 1
+        files += part.written()
+    return files, count
+
+
+def line_of(key: str, wire: WireBody, body: Mapping[str, Any]) -> dict[str, Any]:
+    """The line of a call with this body, in its provider's form."""
+    match wire.api:
+        case "gemini":
+            return {"key": key, "request": body}
+        case "anthropic":
+            return {"custom_id": key, "params": body}
+        case _:
+            return {
+                "custom_id": key,
+                "method": "POST",
+                "url": "/v1/" + wire.path.split("/v1/", 1)[-1].lstrip("/"),
+                "body": body,
+            }
+
+
+@dataclass
+class _Part:
+    """The files of one participant, each below its provider's limits."""
+
+    folder: Path
+    name: str
+    files: list[Path] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
+    size: int = 0
+    api: Api = "chat"
+
+    def add(self, api: Api, line: Mapping[str, Any]) -> None:
+        text = json.dumps(line, ensure_ascii=False)
+        most, most_bytes = LIMITS[api]
+        if self.lines and (len(self.lines) >= most or self.size + len(text.encode()) > most_bytes):
+            self._close()
+        self.api = api
+        self.lines.append(text)
+        self.size += len(text.encode()) + 1
+
+    def _close(self) -> None:
+        suffix = "json" if self.api == "anthropic" else "jsonl"
+        path = self.folder / f"{self.name}-{len(self.files) + 1}.{suffix}"
+        text = "\n".join(self.lines) + "\n"
+        if self.api == "anthropic":  # its API takes one object
+            text = '{"requests": [' + ",\n".join(self.lines) + "]}\n"
+        with replacing(path) as part:
+            part.write_text(text, encoding="utf-8")
+        self.files.append(path)
+        self.lines, self.size = [], 0
+
+    def written(self) -> list[Path]:
+        if self.lines:
+            self._close()
+        return self.files
+
+
+# --- import -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Returned:
+    """What a provider returned for a call: a status and a body, or in a word why there is none."""
+
+    status: int = 0
+    body: bytes = b""
+    error: str = ""
+
+
+def is_batch(path: Path) -> bool:
+    """Whether a file is a provider's, and not one of answers in this project's form."""
+    for _, line in read_lines(path):
+        try:
+            parsed = json.loads(line)
+        except (ValueError, RecursionError):
+            return False
+        return isinstance(parsed, dict) and ("custom_id" in parsed or bool({"response", "error"} & {*parsed}))
+    return False
+
+
+def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]:
+    """What a file of OpenAI's, vLLM's, Gemini's or Anthropic's form returns, by key. Raises TrapsError naming lines
+    that are no answers, and keys that are not wanted or stand there twice."""
+    found, wrong = dict[str, Returned](), list[str]()
+    for number, line in read_lines(path):
+        try:
+            key, returned = _returned(json.loads(line))
+        except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+            wrong.append(
+                f"{path}:{number}: no line of a batch that is known ({type(error).__name__}: {plain(error)[:100]})"
+            )
+            continue
+        if key not in wanted:
+            wrong.append(f"{path}:{number}: key {plain(key)[:16]} is not wanted: question, clip or setting changed")
+        elif found.setdefault(key, returned) != returned:
+            wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
+    if wrong:
+        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
+    return found
+
+
+def _returned(line: Any) -> tuple[str, Returned]:
+    if "result" in line:  # Anthropic
+        result = line["result"]
+        if result["type"] == "succeeded":
+            return line["custom_id"], Returned(200, json.dumps(result["message"]).encode())
+        return line["custom_id"], Returned(error=_word(result["type"]))
+    key = line["custom_id"] if "custom_id" in line else line["key"]
+    error, response = line.get("error"), line.get("response")
+    status = int((response or {}).get("status_code") or 0)
+    if error and status >= FAILED:  # vLLM: a status without a body, and beside it what it would have been
+        return key, Returned(status, json.dumps({"error": error.get("error") or error}).encode())
+    if error:
+        return key, Returned(error=_word(error.get("code") or error.get("status") or "error"))
+    if "custom_id" in line:  # OpenAI, vLLM
+        return key, Returned(status, json.dumps(response["body"]).encode())
+    return key, Returned(200, json.dumps(response).encode())  # Gemini
+
+
+def _word(value: Any) -> str:
+    """The kind of a failure of a batch, which the provider names."""
+    return "batch_" + "".join(c for c in str(value).lower() if c.isalnum() or c == "_").removeprefix("batch_")[:40]
+
+
+def outcomes_of(
+    entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, Returned]
+) -> Iterator[tuple[Request, Outcome]]:
+    """Each returned call with its outcome, as the live call would have read it."""
+    by_name: dict[str, list[str]] = {}
+    for key in returned:
+        by_name.setdefault(wanted[key].participant, []).append(key)
+    for name, keys in by_name.items():
+        for some in _some([key for key in keys if not returned[key].error]):
+            answers = [(returned[key].status, returned[key].body) for key in some]
+            yield from zip(
+                (wanted[key] for key in some),
+                replay(entries[name], [wanted[key] for key in some], answers),
+                strict=True,
+            )
+        for key in keys:
+            if returned[key].error:
+                yield wanted[key], Outcome("error", error=returned[key].error, cost_usd=0.0)
+
+
+def failures(outcomes: Sequence[Outcome]) -> str:
+    """The numbers of failed calls by kind, in words; empty if none failed."""
+    kinds = Counter(outcome.error for outcome in outcomes if outcome.kind in ("error", "malformed"))
+    return ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=str))

@@ -1,0 +1,168 @@
+"""Scores corrected for the panel's errors, where people labelled answers that the panel judged (docs/people.md).
+
+A panel that says yes to a share Se of what people call yes, and no to a share Sp of what they call no, says yes to
+p = Se t + (1 - Sp) (1 - t) of answers of which t are yes. Solved for t (Rogan and Gladen 1978), this turns a judged
+share into a corrected one. Se, Sp and the shares are drawn together: a scenario that is resampled takes its labelled
+answers along, so that the intervals hold the uncertainty of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.people.human_score_rows import CORRECTED, PANEL_ERRORS
+from traps_pipeline.people.human_scores import stratum_weights, with_intervals
+from traps_pipeline.people.label_units import ABOUT_ANSWERS, TaskName
+from traps_pipeline.people.labels import truths
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    RESAMPLES,
+    SEED,
+    Drawn,
+    draw_scenarios,
+    figures_of,
+    figures_of_shares,
+    means_over_runs,
+    resampled_sums,
+    run_sums,
+    shares_of,
+    with_unseen,
+)
+from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
+
+SHARES: tuple[TaskName, ...] = ("correctness", "abstention", "abstention")  # behind Acc, FalseAbs and AbsRec
+NO_BETTER = "the panel agrees with people no better than chance"
+Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and specificity, (2, 2, draws)
+
+
+def panel_errors(
+    labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
+) -> pd.DataFrame:
+    """PANEL_ERRORS rows from HUMAN_LABELS rows, and VERDICTS rows of the panel; none where people labelled nothing."""
+    rows = []
+    if _is_labelled(labels):
+        drawn = _drawn(verdicts, resamples, seed)
+        rows = [
+            _errors_row(labels, task, draws, joined_epochs(verdicts["panel"]))
+            for task, draws in _errors(labels, drawn).items()
+        ]
+    return pd.DataFrame(rows, columns=pd.Index(PANEL_ERRORS.names))
+
+
+def corrected(
+    labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
+) -> pd.DataFrame:
+    """CORRECTED rows from the same: every model under every regime, judged and corrected in the same resamples as the
+    leaderboard's. There are none unless people labelled answers for both tasks, since PECS needs both."""
+    nothing = pd.DataFrame(columns=pd.Index(CORRECTED.names))
+    if not _is_labelled(labels):
+        return nothing
+    drawn = _drawn(verdicts, resamples, seed)
+    errors = _errors(labels, drawn)
+    if len(errors) < len(ABOUT_ANSWERS):
+        return nothing
+    taxonomies = [taxonomy_of(dataset) for dataset in verdicts["dataset"]]
+    about = verdicts[["model", "regime", "dataset", "run", "scenario_id"]].assign(taxonomy=taxonomies)
+    items = pd.concat([about, decision_counts(verdicts)], axis=1)
+    panel, rows = joined_epochs(verdicts["panel"]), list[dict[str, Any]]()
+    for key, group in items.groupby(["model", "regime"], sort=True):
+        model, regime = cast(tuple[str, str], key)
+        for dataset, figures in _entry(group, f"{model}|{regime}", drawn, errors).items():
+            entry = {"model": model, "regime": regime, "dataset": dataset, "panel": panel}
+            rows.append(entry | {"n_runs": _runs(group, dataset)} | figures)
+    return pd.DataFrame(rows, columns=pd.Index(CORRECTED.names))
+
+
+def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.ndarray) -> np.ndarray:
+    """The true share behind a judged one, elementwise, within [0, 1]; NaN where the two errors leave nothing to tell
+    yes from no by (sensitivity + specificity is 1 or less)."""
+    gain = sensitivity + specificity - 1
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.clip(np.where(gain > 1e-12, (share + specificity - 1) / gain, np.nan), 0.0, 1.0)
+
+
+def _corrected_ends(share: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """The ends of a corrected share, (2, draws), from those of the judged one, (2, draws), and of sensitivity and
+    specificity, (2, 2, draws): it rises with the share and with specificity, and falls with sensitivity."""
+    sensitivity, specificity = errors[:, 0], errors[:, 1]
+    return rogan_gladen(share, sensitivity[::-1], specificity)
+
+
+def _is_labelled(labels: pd.DataFrame) -> bool:
+    return bool(labels["task"].isin(list(ABOUT_ANSWERS)).any())
+
+
+def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Drawn:
+    items = verdicts[["scenario_id"]].assign(taxonomy=[taxonomy_of(dataset) for dataset in verdicts["dataset"]])
+    return draw_scenarios(items, resamples, seed)
+
+
+def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
+    """Sensitivity and specificity of the panel on each task that people labelled, in every draw; NaN without a yes, or
+    a no, of people."""
+    found: dict[TaskName, np.ndarray] = {}
+    for task in ABOUT_ANSWERS:
+        answers = truths(labels, task).dropna(subset=["truth"])
+        if answers.empty:
+            continue
+        truth, panel = answers["truth"].to_numpy(bool), answers["panel"].to_numpy(bool)
+        counts = np.stack([truth & panel, truth, ~truth & ~panel, ~truth], axis=1) * stratum_weights(answers)[:, None]
+        taxonomies = np.array([taxonomy_of(dataset) for dataset in answers["dataset"]])
+        total, having = np.zeros(()), np.zeros(counts.shape[1] // 2)
+        for taxonomy, (ids, weights) in drawn.scenarios.items():
+            here = taxonomies == taxonomy
+            by_scenario = np.zeros((len(ids), 1, counts.shape[1]))
+            np.add.at(by_scenario[:, 0], ids.get_indexer(pd.Index(answers["scenario_id"][here])), counts[here])
+            total = total + resampled_sums(weights, by_scenario)[0]
+            having = having + (by_scenario[:, 0, 1::2] > 0).sum(axis=0)
+        found[task] = shares_of(with_unseen(total, having, drawn.unseen(task, len(having))))
+    return found
+
+
+def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: str) -> dict[str, Any]:
+    answers = truths(labels, task)
+    decided = answers.dropna(subset=["truth"])
+    n_yes = int(decided["truth"].to_numpy(bool).sum())
+    if n_yes in (0, len(decided)):
+        why = f"people say {'yes' if n_yes else 'no'} of every answer"
+    else:
+        why = None if draws[0, :, 0].sum() > 1 else NO_BETTER
+    return {
+        "task": task,
+        "n_answers": len(decided),
+        "n_tied": len(answers) - len(decided),
+        "n_people": labels.loc[labels["task"] == task, "annotator"].nunique(),
+        "n_yes": n_yes,
+        **with_intervals(("sensitivity", "specificity"), draws),
+        "undefined": why,
+        "panel": panel,
+    }
+
+
+def _entry(group: pd.DataFrame, named: str, drawn: Drawn, errors: Errors) -> dict[str, dict[str, float]]:
+    """The figures of one model and regime, judged and corrected, by dataset."""
+
+    def right(sums: np.ndarray, in_mean: bool) -> np.ndarray:
+        shares = shares_of(sums, in_mean)
+        fixed = [_corrected_ends(shares[:, k], errors[task]) for k, task in enumerate(SHARES)]
+        return figures_of_shares(np.stack(fixed, axis=1))
+
+    sums = run_sums(group, drawn, named)
+    both = [means_over_runs(sums, figures, drawn.resamples + 1) for figures in (figures_of, right)]
+    return {
+        dataset: {**with_intervals(RESAMPLED, figures), **with_intervals(RESAMPLED, both[1][dataset], "_corrected")}
+        for dataset, figures in both[0].items()
+        if not np.isnan(figures[:, :, 0]).all()
+    }
+
+
+def _runs(group: pd.DataFrame, dataset: str) -> int:
+    """How many runs of a model and regime are behind its row of a dataset, or `overall`: those with all four."""
+    if dataset != "overall":
+        return len(set(group["run"][group["dataset"] == dataset]))
+    return sum(len(set(rows["dataset"])) == len(DATASETS) for _, rows in group.groupby("run"))

@@ -1,0 +1,81 @@
+"""The human row: what people score on the clips that models are asked (docs/people.md).
+
+Labels of all people are pooled. A label weighs as many units as it stands for (those of its stratum by the labels of
+it), so that clips which were chosen because the judges are split about them count no more than they do in the study.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.people.human_score_rows import HUMAN_ROW
+from traps_pipeline.people.labels import agreement_of, matrix
+from traps_pipeline.protocol.datasets import taxonomy_of
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    RESAMPLES,
+    SEED,
+    draw_scenarios,
+    figures_of,
+    interval,
+    limits_of,
+    means_over_runs,
+    run_sums,
+)
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts
+
+
+def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
+    """How many units of the study each label stands for, (labels,): its stratum's by the labels of the stratum."""
+    return (labels["stratum_size"] / labels.groupby("stratum")["stratum"].transform("size")).to_numpy(float)
+
+
+def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
+    """Return HUMAN_ROW rows from HUMAN_LABELS rows: figures of all labels of clips, with intervals over scenarios.
+
+    Without a label of a clip there is no row; overall is null until all four datasets have figures.
+    """
+    clips = labels.loc[labels["task"] == "answerability"].reset_index(drop=True)
+    if clips.empty:
+        return pd.DataFrame(columns=pd.Index(HUMAN_ROW.names))
+    counts = decision_counts(clips).mul(stratum_weights(clips), axis=0)
+    items = pd.concat([clips[["dataset", "scenario_id"]].assign(run=1), counts[COUNTS]], axis=1)
+    items["taxonomy"] = items["dataset"].map(taxonomy_of)
+    drawn = draw_scenarios(items, resamples, seed)
+    means = means_over_runs(run_sums(items, drawn, "people"), figures_of, resamples + 1)
+    rows = [_row(dataset, figures, _of(clips, dataset)) for dataset, figures in means.items()]
+    return pd.DataFrame(rows, columns=pd.Index(HUMAN_ROW.names))
+
+
+def _of(clips: pd.DataFrame, dataset: str) -> pd.DataFrame:
+    return clips if dataset == "overall" else clips.loc[clips["dataset"] == dataset]
+
+
+def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, Any]:
+    _, agreement, alpha = agreement_of(matrix(clips, "abstained"))
+    return {
+        "dataset": dataset,
+        "n_people": clips["annotator"].nunique(),
+        "n_labels": len(clips),
+        "n_clips": clips["unit"].nunique(),
+        **with_intervals(RESAMPLED, figures),
+        "agreement": agreement,
+        "alpha": alpha,
+        "seconds": float(np.median(clips["seconds"].to_numpy(float))),
+        "benchmark_version": " + ".join(sorted(set(clips["benchmark_version"]))),
+    }
+
+
+def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
+    """Each figure with its interval, as columns, from ends of which the first is what was observed: (2, names, 1 +
+    resamples)."""
+    columns: dict[str, float] = {}
+    for k, name in enumerate(names):
+        own = float(draws[1, k, 0])
+        low, high = interval(draws[:, k, 1:], own, limits_of(name))
+        columns |= {f"{name}{suffix}": own, f"{name}{suffix}_ci_low": low, f"{name}{suffix}_ci_high": high}
+    return columns

@@ -1,0 +1,297 @@
+"""The confabulation judge against two blind annotators (docs/spec.md 6.3).
+
+`annotation_sheet` writes what the annotators are shown: question, void kind, answer, and the trace where the judge saw
+it; a sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.sheets import no_formula
+from traps_pipeline.base.terminal import text_table
+from traps_pipeline.judging.agreement import cohen_kappa
+from traps_pipeline.judging.confabulation import (
+    AXES,
+    TRACE_AND_OUTPUT,
+    VOID_KINDS,
+    drawn,
+    load_protocol,
+    sample_id,
+)
+from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.workspace import Workspace
+
+LABEL_COLUMNS = ("annotator", "sample_id", *AXES)
+SHEET_COLUMNS = (*LABEL_COLUMNS, "question", "why_unanswerable", "reasoning_trace", "response")
+YES_WORDS, NO_WORDS = ("1", "true", "yes"), ("0", "false", "no")
+DEGENERATE_SHARE = 0.02
+POOLED = "pooled"
+RESAMPLES, SEED = 10_000, 20260101
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class HumanLabels:
+    """Two annotators' labels. annotators: in alphabetical order. sample_ids: failures. labels: (2, failures, axes)."""
+
+    annotators: tuple[str, str]
+    sample_ids: tuple[str, ...]
+    labels: np.ndarray
+
+
+# --- the annotators' files --------------------------------------------------------------------------------------------
+
+
+def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
+    """What an annotator is shown of each failure: sample_id, question, why_unanswerable, reasoning_trace (empty without
+    one) and response, in an order that reveals nothing. Raises TrapsError if no failure of the models to validate was
+    labelled, or if a failure's answer has been replaced."""
+    protocol = load_protocol()
+    labels = _judged(workspace)
+    labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
+    if labels.empty:
+        raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
+    chosen = drawn(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
+    return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
+
+
+def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
+    """The rows that an annotator fills in: SHEET_COLUMNS by failure, of `sheet_rows`, safe for a spreadsheet."""
+    empty = dict.fromkeys(LABEL_COLUMNS, "")
+    return [
+        empty | {name: str(no_formula(text)) for name, text in row.items()} | {"sample_id": row["sample_id"]}
+        for row in sheet_rows(workspace)
+    ]
+
+
+def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> dict[str, str]:
+    evaluation, item_id = Evaluation(label["model"], label["regime"], int(label["run"])), label["item_id"]
+    cell = Cell(label["dataset"], evaluation)
+    response = _row_of(workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"]), item_id)
+    item = _row_of(workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ["item_id", "question"]), item_id)
+    trace = response.get("reasoning") if label["evidence"] == TRACE_AND_OUTPUT else None
+    if not item or sample_id(cell, item_id, response.get("text"), trace) != sample:
+        raise TrapsError(
+            f"{workspace.root}: the labels of {cell.key} are of earlier answers (of {item_id}, for one); materialize "
+            "confabulation, then write the sheet again"
+        )
+    return {
+        "sample_id": sample,
+        "question": str(item["question"]),
+        "why_unanswerable": VOID_KINDS[label["void_kind"]],
+        "reasoning_trace": str(trace or ""),
+        "response": str(response["text"]),
+    }
+
+
+def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
+    """The texts of an item's row; empty if there is no row."""
+    rows = frame.loc[frame["item_id"] == item_id].to_dict("records")
+    return {name: value for row in rows for name, value in row.items() if isinstance(value, str)}
+
+
+def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
+    """Write a sheet, or labels alone (LABEL_COLUMNS), as CSV. Raises TrapsError if the file exists already, since it
+    may hold labels."""
+    if path.exists():
+        raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        writer.writerows([row[name] for name in columns] for row in rows)
+
+
+def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
+    """The labels of two annotators from a CSV file (LABEL_COLUMNS; others are ignored; true/false, yes/no or 1/0).
+
+    known: sample ids that the judge has labelled. Raises TrapsError naming the lines and columns that are wrong.
+    """
+    found: dict[tuple[str, str], tuple[int, list[bool]]] = {}
+    wrong: list[str] = []
+    for line, row in _lines(path):
+        annotator, sample = row["annotator"], row["sample_id"]
+        problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
+        if sample and sample not in known:
+            problems.append(f"sample_id {sample!r:.40} is not a failure that the judge has labelled")
+        problems += [
+            f"{axis} is {row[axis]!r:.40}; write 1 or 0, true or false, yes or no"
+            for axis in AXES
+            if row[axis].lower() not in (*YES_WORDS, *NO_WORDS)
+        ]
+        if (annotator, sample) in found:
+            problems.append(f"{annotator:.40} has already labelled {sample:.40} on line {found[annotator, sample][0]}")
+        wrong += [f"{path}:{line}: {problem}" for problem in problems]
+        found.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
+    _refuse(wrong)
+    return _paired(path, found)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """The rows of a CSV file with their line numbers, every LABEL_COLUMNS value a stripped text."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in LABEL_COLUMNS if name not in (reader.fieldnames or ())]
+            if missing:
+                needed = ", ".join(LABEL_COLUMNS)
+                raise TrapsError(f"{path}:1: column {', '.join(missing)} is missing; it needs {needed}")
+            for row in reader:
+                yield reader.line_num, {name: (row[name] or "").strip() for name in LABEL_COLUMNS}
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise TrapsError(f"{path}: cannot be read as CSV ({error})") from error
+
+
+def _paired(path: Path, found: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
+    names = sorted({annotator for annotator, _ in found})
+    if len(names) != 2:
+        raise TrapsError(
+            f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
+        )
+    one, other = names
+    samples = sorted({sample for _, sample in found})
+    alone = [(a, s, line) for (a, s), (line, _) in found.items() if (other if a == one else one, s) not in found]
+    _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
+    labels = np.array([[found[name, sample][1] for sample in samples] for name in names], bool)
+    return HumanLabels((one, other), tuple(samples), labels)
+
+
+def _refuse(wrong: Sequence[str]) -> None:
+    if wrong:
+        more = f"\n... and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
+        raise TrapsError("\n".join(wrong[:_SHOWN]) + more)
+
+
+# --- the comparison ---------------------------------------------------------------------------------------------------
+
+
+def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
+    """JUDGE_VALIDATION rows from a label file, which are also written to the workspace. Raises TrapsError for a wrong
+    file, and for a study without labelled failures."""
+    judged = _judged(workspace).set_index("sample_id")
+    if judged.empty:
+        raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
+    human = read_labels(path, list(map(str, judged.index)))
+    rows = compare(judged.loc[list(human.sample_ids), [*AXES]].to_numpy(bool), human)
+    state = workspace.tables.state(CONFABULATION, {})
+    inputs = {"confabulation": state.version if state else "", "labels": file_digest(path)}
+    workspace.tables.write(JUDGE_VALIDATION, {}, rows, inputs)
+    return rows
+
+
+def _judged(workspace: Workspace) -> pd.DataFrame:
+    """The validly labelled failures."""
+    labels = workspace.tables.read(CONFABULATION, {})
+    return labels.loc[labels["valid"].to_numpy(bool)]
+
+
+def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
+    """JUDGE_VALIDATION rows of the judge's labels, (failures, axes) of bool, against both annotators'.
+
+    Pooled labels are both annotators' labels side by side, without a consensus: 2 x failures per axis.
+    """
+    rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
+    agreed = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
+    rows.append(
+        _shared(POOLED, judge.shape[0], human)
+        | {"n_labels": 2 * judge.size, "accuracy": float(np.mean(human.labels == judge))}
+        | {"accuracy_a": agreed[0], "accuracy_b": agreed[1]}
+        | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
+    )
+    return pd.DataFrame(rows, columns=pd.Index(JUDGE_VALIDATION.names))
+
+
+def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
+    a, b = human.annotators
+    return {"axis": axis, "n_failures": failures, "annotator_a": a, "annotator_b": b}
+
+
+def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
+    """judge: (failures,); labels: (2, failures)."""
+    one, other = labels
+    hits = int((labels & judge).sum())
+    precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
+    defined = judge.any() and labels.any()  # whether both precision and recall are defined
+    kappa, low, high = _kappa(one, other)
+    return _shared(axis, len(judge), human) | {
+        "n_labels": labels.size,
+        "accuracy": float(np.mean(labels == judge)),
+        "precision": precision,
+        "recall": recall,
+        "f1": _share(2 * hits, 2 * int(judge.sum()) + int(labels.sum())) if defined else np.nan,
+        "accuracy_a": float(np.mean(one == judge)),
+        "accuracy_b": float(np.mean(other == judge)),
+        "human_agreement": float(np.mean(one == other)),
+        "human_kappa": kappa,
+        "human_kappa_low": low,
+        "human_kappa_high": high,
+        "kappa_note": "degenerate" if np.isnan(kappa) else None,
+    }
+
+
+def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether one class has at most 2 % of either annotator's labels: kappa then says nothing about agreement."""
+    return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
+
+
+def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
+    """Return Cohen's kappa and its 95 % interval, a Bayesian bootstrap over failures; NaN where degenerate.
+
+    One failure is unseen: at the lower end the annotators differ on it, at the upper end they agree. So the interval
+    keeps a width where they always agree.
+    """
+    if is_degenerate(one, other):
+        return np.nan, np.nan, np.nan
+    cells = np.bincount(2 * one.astype(int) + other, minlength=4)  # no and no, no and yes, yes and no, yes and yes
+    rng = np.random.default_rng(SEED)
+    drawn, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
+    shares = drawn + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
+    shares /= shares.sum(axis=-1, keepdims=True)
+    p, q = shares[..., 2] + shares[..., 3], shares[..., 1] + shares[..., 3]
+    chance = p * q + (1 - p) * (1 - q)
+    draws = (shares[..., 0] + shares[..., 3] - chance) / (1 - chance)
+    kappa = cohen_kappa(one.astype(int), other.astype(int))
+    low, high = np.quantile(draws[1:3].min(axis=0), 0.025), np.quantile(draws[[0, 3]].max(axis=0), 0.975)
+    return kappa, min(float(low), kappa), max(float(high), kappa)
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else np.nan
+
+
+def validation_text(rows: pd.DataFrame) -> str:
+    """JUDGE_VALIDATION rows as a person reads them."""
+    first = rows.iloc[0]
+    title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures"
+    headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
+    shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")
+    cells = [
+        [row["axis"], row["n_labels"], *(_figure(row[name]) for name in shares), *_kappa_cells(row)]
+        for row in rows.to_dict("records")
+    ]
+    return f"{title}\n{text_table(headings, cells)}"
+
+
+def _kappa_cells(row: Mapping[Any, Any]) -> tuple[str, str]:
+    """Kappa, or why there is none, and its interval."""
+    if pd.notna(row["kappa_note"]):
+        return row["kappa_note"], ""
+    if np.isnan(row["human_kappa"]):
+        return "", ""
+    return f"{row['human_kappa']:.2f}", f"{row['human_kappa_low']:.2f} to {row['human_kappa_high']:.2f}"
+
+
+def _figure(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.3f}"

@@ -1,0 +1,176 @@
+"""What people label: the clips and answers of each task, and the seeded sample of them (docs/people.md).
+
+Everything that could be labelled in a task is a unit. Its id is a digest of what is shown, so that people's labels of
+one clip or answer are never taken for labels of another. Units of a task are in groups, and each group in two strata:
+those that split the judges, and the others. The units with the smallest digests of a stratum are sampled, so that
+labels of a stratum are a random sample of it, and figures can give each stratum the weight that it has in the study.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field
+
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.judging.confabulation import load_protocol
+from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS
+from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.judges import panel_id
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.people.human_label_rows import PROTOCOL_FILE
+from traps_pipeline.people.judge_validation import sheet_rows
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.workspace import Workspace
+
+TaskName = Literal["answerability", "confabulation", "abstention", "correctness"]
+TASKS: tuple[TaskName, ...] = get_args(TaskName)
+ABOUT_ANSWERS: tuple[TaskName, ...] = ("abstention", "correctness")  # in which people decide what the panel decides
+UNIT_COLUMNS = (
+    *("unit", "item_id", "dataset", "scenario_id", "side", "model", "regime", "run"),
+    *("group", "split", "panel", "benchmark_version"),
+)
+_ANSWER = ["dataset", "model", "regime", "run", "item_id"]
+_UNIT_DIGITS = 16
+
+
+class Sizes(BaseModel):
+    """How many units of each group of a task are sampled."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    answerability: int = Field(ge=1)
+    abstention: int = Field(ge=1)
+    correctness: int = Field(ge=1)
+
+
+class AnnotationProtocol(BaseModel):
+    """`assets/annotation.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    seed: int
+    sizes: Sizes
+    split_share: float = Field(ge=0, le=1)
+    split_from: float = Field(gt=0, le=1)
+    sitting_hours: float = Field(gt=0)
+
+
+@cache
+def annotation_protocol(path: Path = PROTOCOL_FILE) -> AnnotationProtocol:
+    """The protocol. Raises TrapsError naming the field that is wrong."""
+    return parse_yaml_model(AnnotationProtocol, read_yaml(path), path)
+
+
+def units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
+    """UNIT_COLUMNS of everything in the study that the task could label: panel is what the panel decided (null but in
+    ABOUT_ANSWERS), model, regime and run are null for clips. A study without such things gives no rows."""
+    if task == "answerability":
+        found = _clips(workspace)
+    elif task == "confabulation":
+        found = _failures(workspace)
+    else:
+        found = _answers(workspace, task)
+    return found.reindex(columns=pd.Index(UNIT_COLUMNS)).reset_index(drop=True)
+
+
+def _clips(workspace: Workspace) -> pd.DataFrame:
+    columns = ["item_id", "dataset", "scenario_id", "side", "item_hash", "benchmark_version"]
+    items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS)
+    verdicts = current(workspace, VERDICTS, ["item_id", "n_valid", "unanimous"])
+    judged = verdicts.loc[verdicts["n_valid"] > 0]
+    contested = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()
+    share = items["item_id"].map(contested).fillna(0.0)
+    return items.assign(
+        unit=[
+            _unit("answerability", item, hash_)
+            for item, hash_ in zip(items["item_id"], items["item_hash"], strict=True)
+        ],
+        group=items["dataset"] + " " + items["side"],
+        split=share >= annotation_protocol().split_from,
+    )
+
+
+def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
+    """The answers whose abstention or correctness the study's panel decided."""
+    decision = "abstained" if task == "abstention" else "correct"
+    verdicts = current(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
+    decided = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
+    if decided.empty:
+        return decided.assign(unit="")
+    texts = workspace.tables.read_all(RESPONSES, [*_ANSWER, "text"], dataset=DATASETS)
+    items = workspace.tables.read_all(
+        ITEMS, ["item_id", "question", "ground_truth", "benchmark_version"], dataset=DATASETS
+    )
+    rows = decided.merge(texts, on=_ANSWER, validate="one_to_one").merge(items, on="item_id", validate="many_to_one")
+    panel = rows[decision].astype(bool)
+    asked = ["question"] if task == "abstention" else ["question", "ground_truth"]
+    shown = rows[[*_ANSWER, *asked, "text"]].itertuples(index=False, name=None)
+    return rows.assign(
+        unit=[_unit(task, *map(str, each)) for each in shown],
+        group=rows["side"] + np.where(panel, " yes", " no"),
+        split=~rows["unanimous"].astype(bool),
+        panel=panel,
+    )
+
+
+def _failures(workspace: Workspace) -> pd.DataFrame:
+    """The failures that the judge of confabulation labelled; `validation` samples them."""
+    rows = workspace.tables.read_all(CONFABULATION)
+    judged = rows.loc[rows["valid"].astype(bool) & rows["model"].isin(load_protocol().validation.models)]
+    scenarios = judged["item_id"].str.split(":").str[1]
+    return judged.assign(unit=judged["sample_id"], scenario_id=scenarios, side="void", group="failures", split=False)
+
+
+def _unit(*shown: str) -> str:
+    return digest([*shown])[:_UNIT_DIGITS]
+
+
+def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
+    """The units that people are given, as `units` has them: `drawn` of each group, or the sheet's failures."""
+    whole = units(workspace, task)
+    if whole.empty:
+        return whole
+    if task == "confabulation":
+        chosen = {row["sample_id"] for row in sheet_rows(workspace)}
+        return whole.loc[whole["unit"].isin(sorted(chosen))].reset_index(drop=True)
+    protocol = annotation_protocol()
+    size = getattr(protocol.sizes, task)
+    picked = [drawn_units(group, size, protocol) for _, group in whole.groupby("group", sort=True)]
+    return pd.concat(picked, ignore_index=True)
+
+
+def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) -> pd.DataFrame:
+    """A seeded sample of a group without replacement: a share from all units, then the rest from those that split the
+    judges and, where these are too few, from all again. All units where there are no more than `size`."""
+    order = [digest([protocol.seed, unit]) for unit in group["unit"]]
+    ordered = group.iloc[np.argsort(order)]
+    at_random = ordered.head(size - round(size * protocol.split_share))
+    left = ordered.loc[~ordered["unit"].isin(at_random["unit"])]
+    split_first = left.sort_values("split", ascending=False, kind="stable")
+    return pd.concat([at_random, split_first.head(size - len(at_random))])
+
+
+def strata(whole: pd.DataFrame) -> pd.Series:
+    """The stratum of each unit, on the frame's index."""
+    split = np.where(whole["split"].to_numpy(bool), ", split", "")
+    return pd.Series([f"{group}{part}" for group, part in zip(whole["group"], split, strict=True)], whole.index)
+
+
+def queue_of(who: str, sampled: pd.DataFrame) -> list[str]:
+    """The units of a sample in the order of one person, by a seed of their own."""
+    seed = annotation_protocol().seed
+    return sorted(map(str, sampled["unit"]), key=lambda unit: digest([seed, who, unit]))
+
+
+def require_task(name: str) -> TaskName:
+    """The task of that name. Raises TrapsError with the known names."""
+    for task in TASKS:
+        if task == name:
+            return task
+    raise TrapsError(f"{name}: no task of this name; choose from {', '.join(TASKS)}")

@@ -1,0 +1,233 @@
+"""People's labels as they are stored, and the tables made from them: labels of units of the study, and agreement.
+
+The pages of `traps annotate` append each label to `labels.jsonl`, one checked line a label; a later line of the same
+person about the same unit replaces the earlier one. Stages read that file alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import datetime
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.judging.agreement import krippendorff_alpha
+from traps_pipeline.judging.confabulation import AXES
+from traps_pipeline.judging.judged_answers import is_correct
+from traps_pipeline.judging.ratings import INVALID, NO, YES
+from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
+from traps_pipeline.people.label_units import ABOUT_ANSWERS, TASKS, TaskName, strata, units
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
+from traps_pipeline.storage.workspace import Workspace
+
+MOST_CHARACTERS = 200  # of an answer
+DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
+    "answerability": ("abstained",),
+    "confabulation": AXES,
+    "abstention": ("abstained",),
+    "correctness": ("correct",),
+}
+
+
+class ClipLabel(BaseModel):
+    """What a person says about a clip and its question; answer is null where it cannot be known."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    answer: str | None = Field(min_length=1, max_length=MOST_CHARACTERS)
+
+
+class AbstentionLabel(BaseModel):
+    """Whether an answer abstains."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    abstained: StrictBool
+
+
+class CorrectnessLabel(BaseModel):
+    """Whether an answer says what the ground truth says."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    correct: StrictBool
+
+
+class AxesLabel(BaseModel):
+    """Which axes of confabulation hold."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    hallucinated_premise: StrictBool
+    invalid_inference: StrictBool
+    epistemic_surrender: StrictBool
+    doubt_in_reasoning: StrictBool
+
+
+Label = ClipLabel | AbstentionLabel | CorrectnessLabel | AxesLabel
+LABELS: Mapping[TaskName, type[Label]] = {
+    "answerability": ClipLabel,
+    "confabulation": AxesLabel,
+    "abstention": AbstentionLabel,
+    "correctness": CorrectnessLabel,
+}
+
+
+class Line(BaseModel):
+    """A line of `labels.jsonl`; seq counts the labels of all people."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    seq: int = Field(ge=1)
+    task: TaskName
+    unit: str
+    who: str = Field(min_length=1)
+    at: datetime
+    seconds: float = Field(ge=0)
+    label: dict[str, Any]
+
+
+def label_lines(folder: Path) -> list[Line]:
+    """The labels in a study's folder of labels, in order; none where nobody has labelled. Raises TrapsError for a line
+    that is not what was written; a last line that a crash cut off was never confirmed and is left out."""
+    path, found = folder / LABELS_FILE, list[Line]()
+    if not path.is_file():
+        return found
+    for line in read_checked(path):
+        if line.torn:
+            continue
+        if not line.whole:
+            raise TrapsError(f"{path}:{line.number}: is {NOT_WHOLE}; restore the file from a copy")
+        try:
+            read = Line.model_validate_json(line.content)
+            LABELS[read.task].model_validate(read.label)
+        except ValidationError as error:
+            raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
+        found.append(read)
+    return found
+
+
+# --- labels of what the study has -------------------------------------------------------------------------------------
+
+
+def human_labels(workspace: Workspace) -> pd.DataFrame:
+    """HUMAN_LABELS rows: the last label of each person about each unit that the study still has."""
+    last: dict[tuple[TaskName, str, str], dict[str, Any]] = {}
+    for line in label_lines(workspace.labels):
+        key = line.task, line.unit, line.who
+        row = {"task": line.task, "unit": line.unit, "annotator": line.who, "created_at": line.at, **line.label}
+        last[key] = row | {"seconds": last[key]["seconds"] if key in last else line.seconds}
+    given, frames = pd.DataFrame(list(last.values())), list[pd.DataFrame]()
+    for task in TASKS if len(given) else ():
+        own = given.loc[given["task"] == task]
+        if len(own):
+            whole = units(workspace, task)
+            whole["stratum"] = strata(whole)
+            whole["stratum_size"] = whole.groupby("stratum")["unit"].transform("size")
+            frames.append(own.merge(whole, on="unit", how="inner", validate="many_to_one"))
+    if not frames:
+        return pd.DataFrame(columns=pd.Index(HUMAN_LABELS.names))
+    rows = pd.concat(frames, ignore_index=True).reindex(columns=pd.Index(HUMAN_LABELS.names))
+    return _with_answers(workspace, rows.astype(object).where(rows.notna(), None))
+
+
+def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows, in which answers about clips are read as models' answers are: abstained, and correct on a control."""
+    columns = ["item_id", "ground_truth", "answer_type", "labels", "aliases"]
+    items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS).set_index("item_id").to_dict("index")
+
+    def right(row: Mapping[Any, Any]) -> bool:
+        item = items[row["item_id"]]
+        aliases = json.loads(item["aliases"])
+        return is_correct(row["answer"], item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
+
+    read = []
+    for row in rows.to_dict("records"):
+        if row["task"] == "answerability":
+            row["abstained"] = row["answer"] is None
+            row["correct"] = right(row) if row["side"] == "control" else None
+        read.append(row)
+    return pd.DataFrame(read, columns=pd.Index(HUMAN_LABELS.names))
+
+
+# --- agreement --------------------------------------------------------------------------------------------------------
+
+
+def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
+    """HUMAN_AGREEMENT rows from HUMAN_LABELS rows."""
+    rows = []
+    for task in TASKS:
+        own = labels.loc[labels["task"] == task]
+        rows += [_agreement(task, decision, own) for decision in DECISIONS[task] if len(own)]
+    return pd.DataFrame(rows, columns=pd.Index(HUMAN_AGREEMENT.names))
+
+
+def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str, Any]:
+    values = matrix(labels, decision)
+    n_shared, agreed, alpha = agreement_of(values)
+    why = "every label is the same" if n_shared else "nothing was labelled by two people"
+    return {
+        "task": task,
+        "decision": decision,
+        "annotators": "+".join(sorted(labels["annotator"].unique())),
+        "n_labels": len(labels),
+        "n_units": len(values),
+        "n_shared": n_shared,
+        "agreement": agreed,
+        "alpha": alpha,
+        "undefined": why if np.isnan(alpha) else None,
+        "seconds": float(np.median(labels["seconds"].to_numpy(float))),
+    }
+
+
+def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
+    """Of labels as `matrix` gives them: the units that two people or more labelled, the share of pairs of labels of the
+    same unit that are equal, and Krippendorff's alpha; NaN where undefined."""
+    several = int(((values != INVALID).sum(axis=1) > 1).sum())
+    pairs = [values[:, [a, b]] for a, b in combinations(range(values.shape[1]), 2)]
+    shared = np.concatenate([both[(both != INVALID).all(axis=1)] for both in pairs] or [np.zeros((0, 2), np.int8)])
+    agreed = float((shared[:, 0] == shared[:, 1]).mean()) if len(shared) else float("nan")
+    return several, agreed, krippendorff_alpha(values) if several else float("nan")
+
+
+def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
+    """Labels as YES, NO and INVALID (not labelled): (units, people) int8, both in alphabetical order."""
+    names, people = (sorted(labels[column].unique()) for column in ("unit", "annotator"))
+    values = np.full((len(names), len(people)), INVALID, np.int8)
+    places = (
+        pd.Index(names).get_indexer(pd.Index(labels["unit"])),
+        pd.Index(people).get_indexer(pd.Index(labels["annotator"])),
+    )
+    values[places] = np.where(labels[decision].astype(bool), YES, NO)
+    return values
+
+
+def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
+    """What most people say about each unit of ABOUT_ANSWERS: one row a unit, in the columns of HUMAN_LABELS and `truth`
+    (null where as many say yes as no)."""
+    if task not in ABOUT_ANSWERS:
+        raise ValueError(f"{task}: the panel decides nothing of the kind")
+    own = labels.loc[labels["task"] == task]
+    share = own[DECISIONS[task][0]].astype(bool).groupby(own["unit"]).mean()
+    first = own.sort_values("annotator").drop_duplicates("unit")
+    most = first["unit"].map(share)
+    return first.assign(truth=np.where(most == 0.5, None, most > 0.5))
+
+
+def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
+    """The labels of confabulation as `traps confabulation validate` reads them, from HUMAN_LABELS rows: of failures
+    that everybody who labelled any has labelled. Raises TrapsError where there are none."""
+    own = labels.loc[labels["task"] == "confabulation"]
+    everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()
+    shared = own.loc[everybody.to_numpy(bool)]
+    if shared.empty:
+        raise TrapsError("no failure is labelled by everybody yet; label some on the pages of `traps annotate`")
+    return [
+        {"annotator": row["annotator"], "sample_id": row["unit"], **{axis: str(int(row[axis])) for axis in AXES}}
+        for row in shared.sort_values(["annotator", "unit"]).to_dict("records")
+    ]

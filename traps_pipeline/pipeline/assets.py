@@ -1,0 +1,106 @@
+"""Dagster's assets of the declared stages and sources."""
+
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack
+from typing import Any, cast
+
+import dagster as dg
+from pydantic import PrivateAttr
+
+from traps_pipeline.pipeline.checks import CURRENT, CURRENT_DOC
+from traps_pipeline.pipeline.graph import Graph, Source, Stage
+from traps_pipeline.pipeline.step import Event, guarded, run_step
+from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
+from traps_pipeline.storage.place import place_of
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+OWNERS = ["team:benchmark"]
+
+
+class WorkspaceResource(dg.ConfigurableResource):
+    """The study that a run works in."""
+
+    root: str
+    _steps: ExitStack = PrivateAttr(default_factory=ExitStack)
+
+    def until_torn_down(self, events: Generator[Event, None, None]) -> Iterator[Event]:
+        """Pass a step's events on, and close the step when the run ends at the latest.
+
+        Where Dagster cannot write an event down, it drops the step in the middle. Closed here, its calls in flight come
+        back and are stored, and its locks are given back; the garbage collector would close it after the threads of
+        these calls are gone, and wait for them for ever.
+        """
+        self._steps.callback(events.close)
+        return events
+
+    def teardown_after_execution(self, context: dg.InitResourceContext) -> None:
+        """See `until_torn_down`."""
+        self._steps.close()
+
+    def open(self) -> Workspace:
+        """The workspace. Raises TrapsError naming the remedy where there is none."""
+        return Workspace.open(place_of(self.root))
+
+
+def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
+    """An asset of each stage, and an observable one of each source."""
+    return [_asset(graph, one) if isinstance(one, Stage) else _observable(one) for one in graph.declared.values()]
+
+
+def _observable(source: Source) -> dg.AssetsDefinition:
+    partitions = partitions_of(source.scheme) if source.scheme else None
+
+    @dg.observable_source_asset(
+        key=asset_key(source.name),
+        partitions_def=partitions,
+        group_name=source.group,
+        description=source.doc,
+        tags={f"dagster/kind/{kind}": "" for kind in source.kinds},
+        metadata={"owner": OWNERS[0]},
+    )
+    def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
+        opened = workspace.open()
+        if source.scheme is None:
+            return dg.DataVersion(source.version(opened, None))
+        return dg.DataVersionsByPartition({key: source.version(opened, key) for key in source.scheme.keys})
+
+    return cast(dg.AssetsDefinition, observe)
+
+
+def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
+    key, partitions = asset_key(stage.name), partitions_of(stage.scheme) if stage.scheme else None
+    checks = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in stage.checks)]
+
+    @dg.asset(
+        key=key,
+        deps=asset_deps(graph, stage.name),
+        description=stage.doc,
+        group_name=stage.group,
+        kinds={*stage.kinds},
+        owners=OWNERS,
+        partitions_def=partitions,
+        metadata=_contract(stage.table) if stage.table is not None else {},
+        code_version=stage.code,
+        tags={"cost": stage.cost} if stage.cost else None,
+        backfill_policy=dg.BackfillPolicy.single_run() if stage.scheme else None,
+        output_required=False,
+        check_specs=[
+            dg.AssetCheckSpec(name, asset=key, description=doc, blocking=blocks, partitions_def=partitions)
+            for name, doc, blocks in checks
+        ],
+    )
+    def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
+        events = guarded(run_step(stage, context, workspace.open()), context)
+        yield from workspace.until_torn_down(events)
+
+    return asset
+
+
+def _contract(table: Table) -> dict[str, Any]:
+    """A table's columns and the meaning of a row, as Dagster shows them."""
+    columns = [
+        dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
+        for c in table.columns
+    ]
+    return {"dagster/column_schema": dg.TableSchema(columns=columns), "one row is": table.row}

@@ -1,0 +1,189 @@
+"""Jobs that make a part of the study by one command or click, and sensors that follow corrections.
+
+A job makes what is missing or stale of its stages for everything that the study's experiments ask. Dagster cannot run
+assets of different partitions in one job, so a job whose stages have several is one op, which starts a run for each
+block of stages that share their partitions and links them; `report` selects its assets. The sensors target assets:
+they request runs of what is there and outdated. They look at the state of the tables, not at events, so that a
+correction that was made while they were off is followed, too.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.corrections import folded
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.judging.confabulation import load_protocol
+from traps_pipeline.models.judges import load_judges, load_panel
+from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
+from traps_pipeline.models.registry import load_accounts, load_models
+from traps_pipeline.pipeline.assets import WorkspaceResource
+from traps_pipeline.pipeline.checks import CURRENT
+from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
+from traps_pipeline.pipeline.history import History
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.machine import require_machine, wanted_parts
+from traps_pipeline.pipeline.ranges import batches
+from traps_pipeline.pipeline.run import pending_in, walk
+from traps_pipeline.pipeline.runs import RunsHere, range_tags
+from traps_pipeline.pipeline.selection import failed_checks
+from traps_pipeline.pipeline.step import MAKE_TAG, OUTDATED, STALE
+from traps_pipeline.pipeline.translation import asset_key
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.workspace import Workspace
+
+DESCRIPTIONS = {
+    "benchmark": "Scenarios, clips and items.",
+    "evaluation": "Answers, votes and verdicts; asks what the ledger does not hold.",
+    "scoring": "Metrics, contrasts, leaderboard; agreement, confabulation, people's labels.",
+    "mechanism": "Hidden states, probes, directions and steering of local models.",
+    "report": "Tables, figures and pages.",
+}
+EVERYTHING = "everything"
+UNFINISHED = [
+    dg.DagsterRunStatus.QUEUED,
+    dg.DagsterRunStatus.NOT_STARTED,
+    dg.DagsterRunStatus.STARTING,
+    dg.DagsterRunStatus.STARTED,
+]
+INTERVAL_S = 30
+
+
+def reread_sources() -> None:
+    """Forget what was read of specs, corrections, prompts and registries: a server that lives long sees edits then.
+
+    Which evaluations there are stays: partition keys are made from them when the code location is loaded.
+    """
+    registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
+    for cached in (load_released, folded, prompt, system_prompt, vqa_prompt, *registries):
+        cached.cache_clear()
+
+
+def jobs() -> list[Any]:
+    """Return a job for each part of the graph and one for all of it, once the stages are declared."""
+    stages = the_graph().stages
+    parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
+    every = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
+    return [*(_job(name, DESCRIPTIONS[name], part) for name, part in parts.items() if part), every]
+
+
+def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
+    if all(stage.scheme is None for stage in stages):
+        selection = dg.AssetSelection.assets(*(asset_key(stage.name) for stage in stages))
+        return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE})
+
+    @dg.op(name=f"make_{name}", description=doc)
+    def make(context: dg.OpExecutionContext, workspace: WorkspaceResource) -> None:
+        reread_sources()
+        opened, names = workspace.open(), [stage.name for stage in stages]
+        require_machine(opened, wanted_parts(opened, names))
+        every_asset = context.repository_def.get_implicit_global_asset_job_def()
+        runs = RunsHere(context.instance, every_asset, parent=context.run, log=context.log.info)
+        outcome = walk(context.instance, runs, opened, names)
+        if runs.finished:
+            context.add_output_metadata({"runs": dg.MetadataValue.table([dg.TableRecord(r) for r in runs.finished])})
+        if problems := [*dict.fromkeys([*outcome.problems, *failed_checks(opened, None)])]:
+            raise TrapsError("\n".join(problems))
+
+    @dg.job(name=name, description=doc)
+    def job() -> None:
+        make()
+
+    return job
+
+
+def _stages(costs: bool) -> list[Stage]:
+    return [stage for stage in the_graph().stages if costs or not stage.cost]
+
+
+def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
+    """Fail the check `current` for what Dagster does not see by itself: files that are altered or gone, and assets
+    without partitions that are not current. reported: what this process has reported before."""
+    wanted, history = Wanted(workspace), History(instance, the_graph())
+    for stage in the_graph().stages:
+        recorded = history.recorded(stage.name)
+        for key in stage.wanted(wanted):
+            status = lineage.status(stage.name, key)
+            wrong = [*status.outdated] if stage.scheme is None else [*filter(None, [lineage.damage(stage.name, key)])]
+            if status.kind == "missing" and key in recorded:
+                wrong = ["its file is gone; materialize it again: nothing that the ledger holds is asked"]
+            text = f"{name_of((stage.name, key))}: {'; '.join(wrong)}"
+            if wrong and text not in reported:
+                reported.add(text)
+                instance.report_runless_asset_event(
+                    dg.AssetCheckEvaluation(
+                        asset_key=asset_key(stage.name),
+                        check_name=CURRENT,
+                        passed=False,
+                        partition=key,
+                        metadata={"not current": "; ".join(wrong)},
+                    )
+                )
+
+
+def _requests(
+    instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
+) -> list[dg.RunRequest]:
+    """Runs of what is outdated and can be made anew now. What waits for these is requested at a later look."""
+    graph, requests = the_graph(), list[dg.RunRequest]()
+    for block in graph.blocks([stage.name for stage in _stages(costs)]):
+        stages, keys = pending_in(block, lineage, History(instance, graph), Wanted(workspace), existing=True)
+        nodes = [(stage.name, key) for stage in stages for key in keys]
+        # What is outdated and stays so, with the same inputs, is tried once: it fails for a reason of its own.
+        seen = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
+        for one in batches(block[0].scheme, keys):
+            requests.append(
+                dg.RunRequest(
+                    digest([*one, seen])[:32],
+                    partition_key=one[0] if one[0] == one[1] else None,
+                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(one)},
+                    asset_selection=[asset_key(stage.name) for stage in stages],
+                )
+            )
+    return requests
+
+
+def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
+    reported: set[str] = set()
+
+    @dg.sensor(
+        name=name,
+        asset_selection=dg.AssetSelection.assets(*(asset_key(stage.name) for stage in _stages(costs))),
+        minimum_interval_seconds=INTERVAL_S,
+        default_status=dg.DefaultSensorStatus.STOPPED if costs else dg.DefaultSensorStatus.RUNNING,
+        description=doc,
+    )
+    def follow(
+        context: dg.SensorEvaluationContext, workspace: WorkspaceResource
+    ) -> dg.SkipReason | list[dg.RunRequest]:
+        reread_sources()
+        opened = workspace.open()
+        lineage = Lineage(opened)
+        History(context.instance, the_graph()).observe(lineage)
+        _report_unseen(context.instance, opened, lineage, reported)
+        if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
+            return dg.SkipReason("runs are under way")
+        requests = _requests(context.instance, opened, lineage, costs=costs)
+        return requests or dg.SkipReason("nothing that is there is outdated")
+
+    return follow
+
+
+def sensors() -> list[dg.SensorDefinition]:
+    """Return the sensors that follow corrections, once the stages are declared."""
+    return [
+        _sensor(
+            "follow_corrections",
+            "Observes specs, corrections, prompts and registries; makes anew what an edit made outdated, unless that "
+            "costs money or a local model's time. Makes nothing that is merely missing.",
+            costs=False,
+        ),
+        _sensor(
+            "follow_corrections_paid",
+            "Off by default. The same for stages that cost money or a local model's time, within the study's budget.",
+            costs=True,
+        ),
+    ]

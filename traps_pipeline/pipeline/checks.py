@@ -1,0 +1,137 @@
+"""The checks of a stage's partitions: what Dagster shows of them, and what a run says at its end."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.pipeline.graph import Graph, Node, Stage, name_of
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.metadata import visible_metadata
+from traps_pipeline.pipeline.translation import asset_key
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+
+CURRENT = "current"  # the check that every stage has
+CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
+REACHED = "a budget is reached"  # in a check's metadata
+STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
+SHOWN = 12  # unmade partitions named in an error
+
+
+class StageChecks:
+    """Evaluates the checks of one stage in one run.
+
+    A failure is kept in the workspace until the partition passes, so that each later run and `traps status` tell of it,
+    even if this run dies before it reports to Dagster.
+
+    The evaluations are no `AssetCheckResult`s: where a blocking one of those fails, Dagster fails the step and skips
+    everything below it, also what can do without. `Lineage.blocked` keeps what cannot from being made.
+    """
+
+    def __init__(self, workspace: Workspace, graph: Graph, stage: Stage) -> None:
+        self._workspace, self._graph, self._stage = workspace, graph, stage
+        self._failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}
+
+    def of_parents(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
+        """Evaluate, before anything is made from them, the parents that are not what was written."""
+        for parent, keys in self._graph.parents(self._stage.name, key).items():
+            if self._graph.source(parent) is None:
+                for above in keys:
+                    if damage := lineage.damage(parent, above):
+                        yield _evaluation(parent, CURRENT, above, {"damaged": damage})
+
+    def of_made(self, key: str | None, made: Made) -> Iterator[dg.AssetCheckEvaluation]:
+        """Evaluate every check of a partition that was just written."""
+        stage, wrong = self._stage, dict[str, Any]()
+        if stage.table is not None:
+            damage = self._workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
+            wrong |= {"damaged": damage} if damage else {}
+        if made.tally.errors:
+            wrong["failed"] = _failed_calls(made.tally.errors)
+        yield self._evaluate(CURRENT, key, wrong)
+        for check in stage.checks:
+            problems = check.wrong(self._workspace, key, made)
+            file = self._workspace.failed_check(stage.name, check.name, key)
+            if problems:
+                self._workspace.store.write({file: json.dumps(problems, default=str).encode()})
+            else:
+                self._workspace.store.remove([file])
+            plain = json.loads(json.dumps(problems, default=str))
+            yield self._evaluate(check.name, key, {"failing": plain} if problems else {})
+
+    def of_unmade(self, key: str | None, error: TrapsError) -> dg.AssetCheckEvaluation:
+        """Evaluate a partition that could not be made."""
+        return self._evaluate(CURRENT, key, {"not made": str(error), REACHED: isinstance(error, BudgetReached)})
+
+    def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
+        """Evaluate once more what fails, also of partitions that this run has not seen: Dagster shows the newest result
+        of a check, and one that passes elsewhere must not hide them."""
+        name = self._stage.name
+        for key in self._graph.keys(name):
+            if key not in seen:
+                for check in self._workspace.failed_checks(name, key):
+                    self._failing[check, key] = {STILL: json.loads(self._workspace.failure(name, check, key))}
+                state = lineage.state(name, key)
+                if state is not None and state.failed:
+                    self._failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
+        for (check, key), wrong in [*self._failing.items()]:
+            yield self._evaluate(check, key, wrong)
+
+    def _evaluate(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
+        if wrong:
+            self._failing[check, key] = wrong
+        return _evaluation(self._stage.name, check, key, wrong)
+
+
+def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) -> None:
+    """Raise TrapsError, or BudgetReached, for all that this run has not made or whose checks do not pass, of a stage
+    and what is above it: had the step above raised, Dagster would have made nothing below it, not even what is sound.
+    """
+    above, failed = graph.above([last]), dict[tuple[str, Node], dg.AssetCheckEvaluation]()
+    of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
+    for entry in context.instance.all_logs(context.run.run_id, of_type=of_type):
+        event = entry.get_dagster_event().asset_check_evaluation_data
+        node = (event.asset_key.path[-1], event.partition)
+        if node[0] in above and STILL not in event.metadata:
+            failed[event.check_name, node] = event
+    alike: dict[tuple[str, str], list[str]] = {}  # by stage and what is said: a reason is told once
+    for (check, node), event in failed.items():
+        for line in _lines(check, node, event):
+            alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
+    if alike:
+        lines = [f"{first} (and {len(more)} more)" if more else first for first, *more in alike.values()]
+        rest = [f"... and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
+        reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
+        raise (BudgetReached if reached else TrapsError)("\n".join([*lines[:SHOWN], *rest]))
+
+
+def _evaluation(stage: str, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
+    return dg.AssetCheckEvaluation(
+        asset_key=asset_key(stage),
+        check_name=check,
+        passed=not wrong,
+        partition=key,
+        metadata=visible_metadata(wrong),
+    )
+
+
+def _failed_calls(count: int) -> str:
+    return f"{count} calls failed and can be asked again"
+
+
+def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterator[str]:
+    """What a failed check says, a line each."""
+    if event.passed:
+        return
+    for name, value in ((name, value.value) for name, value in event.metadata.items() if name != REACHED):
+        if check != CURRENT:
+            text = value if isinstance(value, str) else json.dumps(value)
+            yield f"check {check} of {name_of(node)} does not pass: {text}"
+        else:
+            yield f"{name_of(node)}{' is not made' if name == 'not made' else ''}: {value}"

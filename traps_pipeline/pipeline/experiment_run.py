@@ -1,0 +1,133 @@
+"""`traps run`: what is checked before an experiment is run, the run, and what it did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.progress import Tally
+from traps_pipeline.models.backends import require_libraries
+from traps_pipeline.models.judges import load_panel
+from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.pipeline.experiment import Experiment
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.machine import require_machine, wanted_parts
+from traps_pipeline.pipeline.selection import (
+    failed_checks,
+    is_nothing_to_do,
+    note_versions,
+    require_work,
+    stages_until,
+)
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from dagster import DagsterInstance
+
+    from traps_pipeline.pipeline.runs import Runs
+
+OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs"]]
+
+
+@dataclass
+class RunReport:
+    """What a run did: problems in sentences, whether a budget ended it, seconds, and the work of each stage."""
+
+    problems: list[str] = field(default_factory=list)
+    over_budget: bool = False
+    seconds: float = 0.0
+    tallies: Mapping[str, Tally] = field(default_factory=dict)
+
+    def tally(self, stage: str) -> Tally:
+        """The work of one stage."""
+        return self.tallies.get(stage, Tally())
+
+    @property
+    def frames(self) -> int:
+        """How many frames were rendered."""
+        return sum(tally.frames for tally in self.tallies.values())
+
+
+def run_experiment(
+    workspace: Workspace,
+    experiment: Experiment,
+    *,
+    until: str | None,
+    preflight: Callable[[str], None] | None,
+    look_at_machine: bool,
+    open_runs: OpenRuns,
+) -> RunReport:
+    """Make every missing or stale partition of an experiment; progress is reported to `progress.current()`.
+
+    until: stages with commas between, to make these and what they need alone. preflight: is given
+    a line about each model and judge, which are tried first where it is not None.
+    open_runs: opens what makes the runs; called only where there is something to make, as is Dagster's history.
+    Raises TrapsError where a run cannot begin.
+    """
+    stages = stages_until(until)
+    require_work(workspace, experiment.name, until)
+    if is_nothing_to_do(workspace, stages, experiment.name):
+        return RunReport(failed_checks(workspace, experiment.name))
+    from traps_pipeline.pipeline.run import dagster_history, walk
+
+    with dagster_history(workspace) as instance:
+        participants = _still_to_ask(workspace, experiment, stages)
+        for entry in (*participants.models, *participants.judges):
+            require_libraries(entry)
+        if experiment.mechanism is not None and "hidden_states" in stages:
+            require("local")
+        if look_at_machine:
+            require_machine(workspace, wanted_parts(workspace, stages, experiment.name))
+        if preflight is not None:
+            _preflight(workspace, participants, preflight)
+        with open_runs(instance, workspace) as runs:
+            result = walk(instance, runs, workspace, stages, experiment=experiment.name)
+    problems = [*dict.fromkeys([*result.problems, *failed_checks(workspace, experiment.name)])]
+    if not problems:
+        note_versions(workspace, stages, experiment.name)
+    return RunReport(problems, result.over_budget, result.seconds, progress.current().totals)
+
+
+@dataclass(frozen=True)
+class _Participants:
+    """Models and judges that still have something to answer, and whose libraries or keys may be missing here."""
+
+    models: list[Entry]
+    judges: list[Entry]
+
+
+def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
+    """Return the models and judges that the ledger does not hold all answers of."""
+    lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
+
+    def behind(stage: str) -> Iterator[str]:
+        wanted = cells if stage in stages else ()
+        return (key for key in wanted if lineage.status(stage, key).kind != "fresh")
+
+    asked = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
+    panel = load_panel(workspace.study.panel) if "votes" in stages else ()
+    judges: list[Entry] = [judge for judge in panel if judge.backend == NETWORK]
+    # Whether a cell is behind is looked up for the sake of these alone.
+    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if asked else set[str]()
+    models: list[Entry] = [entry for name, entry in asked.items() if name in names]
+    return _Participants(models, judges if judges and any(behind("votes")) else [])
+
+
+def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
+    """Try the models and judges over the network, before a clip is rendered. Raises TrapsError naming all that is
+    wrong."""
+    models = [entry for entry in participants.models if entry.backend == NETWORK]
+    if not models and not participants.judges:
+        return
+    from traps_pipeline.checks.live_check import preflight, require_sound
+
+    checks = preflight(workspace, models, participants.judges)
+    for check in checks:
+        say(check.line)
+    require_sound(checks)

@@ -1,0 +1,243 @@
+"""`traps plan`: the calls that an experiment would make, with their tokens, dollars and minutes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.benchmark.items import expected_items
+from traps_pipeline.judging.confabulation import load_protocol, sample_failures
+from traps_pipeline.judging.judging_rows import VOTES
+from traps_pipeline.judging.panel import tasks_for, vote_requests
+from traps_pipeline.mechanism.steering import count_answers
+from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
+from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of
+from traps_pipeline.models.judges import JudgeEntry, load_panel
+from traps_pipeline.models.registry import NETWORK, Entry, get_model
+from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.pipeline.experiment import Experiment
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
+from traps_pipeline.protocol.datasets import BESIDE, DATASETS, all_datasets_of, datasets_of_category, sides_of
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+LABEL_TOKENS = 2500  # estimated prompt of a label: instructions, answer and, for half of the models, a trace
+
+
+@dataclass
+class Count:
+    """Numbers of calls: wanted, and of these already in the ledger (known)."""
+
+    wanted: int = 0
+    known: int = 0
+
+    @property
+    def new(self) -> int:
+        """The number of calls still to be made."""
+        return self.wanted - self.known
+
+    def add(self, wanted: int, known: int) -> None:
+        """Add to both counts in place."""
+        self.wanted, self.known = self.wanted + wanted, self.known + known
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The calls of an experiment. calls: answers and votes by model. uncertain: datasets with items that are unknown
+    before a run has made them; their calls are counted as new, which is an upper bound. forecasts: tokens,
+    dollars and minutes of the new calls over the network, by model and judge. labels: calls to the confabulation judge;
+    None if the study's panel has none. steered: answers of steered models and votes on them, by model. pairs: how many
+    there are, by dataset."""
+
+    calls: Mapping[str, tuple[Count, Count]]
+    uncertain: Sequence[str]
+    forecasts: Sequence[Forecast]
+    labels: Count | None
+    steered: Mapping[str, tuple[Count, Count]] = field(default_factory=dict)
+    pairs: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def minutes(self) -> float:
+        """Of all calls: models are asked side by side, and then judges."""
+        models = [row for row in self.forecasts if row.participant in self.calls]
+        judges = [row for row in self.forecasts if row.participant not in self.calls]
+        return minutes_of(models) + minutes_of(judges)
+
+
+def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study) -> Plan:
+    """Count the calls of an experiment and forecast their cost; nothing is sent and nothing is made. study: the
+    workspace's, or the one that a new workspace would have, with the panel that judges."""
+    panel = load_panel(study.panel)
+    calls, uncertain = _count_calls(workspace, experiment, study)
+    steered = _count_steered(workspace, experiment, study)
+    votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
+    new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
+    new += [(judge, votes // len(panel)) for judge in panel]
+    new = [(entry, count) for entry, count in new if entry.backend == NETWORK]
+    of_category = Counter(s.category for s in load_scenarios(study).values())
+    pairs = {
+        dataset: sum(n for category, n in of_category.items() if dataset in datasets_of_category(category))
+        for dataset in DATASETS
+        if dataset in experiment.datasets
+    }
+    ledgers = [ledger.totals() for ledger in (workspace.answers, workspace.votes)] if workspace else []
+    forecasts = [
+        forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
+        for entry, count in new
+    ]
+    judge = load_protocol().judge(study.panel)
+    if judge is None:
+        return Plan(calls, uncertain, forecasts, None, steered, pairs)
+    labels = _count_labels(workspace, experiment, judge)
+    taken = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
+    forecasts.append(replace(taken, participant="confabulation labels"))
+    return Plan(calls, uncertain, forecasts, labels, steered, pairs)
+
+
+def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
+    """Calls for the answers of steered models, and for the panel's votes on them, by model."""
+    settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
+    if settings is None or settings.steering is None:
+        return counts
+    scenarios, seats = load_scenarios(study).values(), len(load_panel(study.panel))
+    taxonomies = [datasets_of_category(scenario.category)[0] for scenario in scenarios]
+    for model in settings.models:
+        answers, votes = counts[model] = (Count(), Count())
+        datasets = [name for name in experiment.datasets if name in DATASETS]
+        for regime, by_side in count_answers(settings, model, datasets, Counter(taxonomies)).items():
+            wanted, ballots = by_side.total(), seats * sum(len(tasks_for(s)) * n for s, n in by_side.items())
+            folder, known = SteeredEvaluation(model, regime, 1).key, [0, 0]
+            if workspace is not None:
+                known = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
+            answers.add(wanted, min(known[0], wanted))
+            votes.add(ballots, min(known[1], ballots))
+    return counts
+
+
+def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
+    """Calls to the confabulation judge about the experiment's models; a model that is not judged yet counts with a full
+    sample."""
+    protocol, wanted = load_protocol(), {cell.key for cell in experiment.cells()}
+    labels, lineage = Count(), Lineage(workspace) if workspace else None
+    for model in protocol.models:
+        cells = [cell for cell in protocol.cells(model) if cell.key in wanted]
+        if not cells:
+            continue
+        if workspace is None or lineage is None or not _judged(lineage, cells):
+            labels.add(protocol.n, 0)
+            continue
+        samples = sample_failures(workspace, judge, model).values()
+        keys = {failure.request.key for failures in samples for failure in failures}
+        labels.add(len(keys), len(workspace.votes.read(cells[0].evaluation.key, keys).settled))
+    return labels
+
+
+def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
+    """Whether the verdicts of all cells whose dataset has items exist and are current."""
+    made = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
+    return bool(made) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in made)
+
+
+def _count_calls(
+    workspace: Workspace | None, experiment: Experiment, study: Study
+) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
+    plan = {model: (Count(), Count()) for model in experiment.models}
+    panel, lineage = load_panel(study.panel), Lineage(workspace) if workspace else None
+    scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
+    current = {dataset for dataset in experiment.datasets if lineage and _items_current(lineage, dataset)}
+    items = {
+        dataset: _items(workspace, lineage, dataset, scenes[dataset], is_current=dataset in current)
+        for dataset in experiment.datasets
+    }
+    for cell in experiment.cells():
+        answers, votes = plan[cell.evaluation.model]
+        asked, unmade = items[cell.dataset]
+        answers.add(unmade.total(), 0)
+        votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unmade.items()), 0)
+        if workspace is None or lineage is None:
+            continue
+        # A fresh cell of current items has all that it wants: neither are its keys made again nor is its ledger read.
+        answered, cast = (_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
+        if answered is not None and cast is not None and cell.dataset in current:
+            answers.add(answered, answered)
+            votes.add(cast, cast)
+        else:
+            _count_cell(workspace, panel, cell, asked, answers, votes)
+    return plan, sorted(dataset for dataset, (_, unmade) in items.items() if unmade)
+
+
+def _items(
+    workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
+) -> tuple[list[dict[str, Any]], Counter[str]]:
+    """Return the items of a dataset that the next run asks, and by side the number of those that are unknown before it
+    has made them. scenes: how many scenarios the dataset has."""
+    unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
+    if workspace is None or lineage is None or lineage.state("items", dataset) is None:
+        return [], unmade
+    if is_current:
+        return asked_items(workspace, dataset), Counter()
+    for stage, key in _made_from(lineage, dataset):
+        state = lineage.state(stage, key)
+        if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
+            return [], unmade
+    if dataset in BESIDE:  # not every scenario admits all
+        unmade = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
+    items = expected_items(workspace, dataset)
+    return items, unmade - Counter(item["side"] for item in items)
+
+
+def _count_cell(
+    workspace: Workspace,
+    panel: Sequence[JudgeEntry],
+    cell: Cell,
+    items: Sequence[Mapping[str, Any]],
+    answers: Count,
+    votes: Count,
+) -> None:
+    """Count the calls for these items of a cell: votes on answers in the ledger by their own keys, and all votes on
+    answers that are still to be asked."""
+    entry, folder = get_model(cell.evaluation.model), cell.evaluation.key
+    keys = {  # an item without media was never asked
+        item["item_id"]: answer_request(workspace, entry, item, cell.evaluation).key
+        for item in items
+        if is_prepared(workspace, entry, item)
+    }
+    rows = workspace.answers.read(folder, {*keys.values()}).settled
+    traces = workspace.answers.reasoning(folder, rows)
+    ballots, n_new = set[str](), 0
+    for item in items:
+        row, tasks = rows.get(keys.get(item["item_id"], "")), tasks_for(item["side"])
+        if row is None:
+            n_new += len(panel) * len(tasks)
+            continue
+        answer = response_row(cell, item, row, traces.get(row["key"]))
+        if answer.outcome in JUDGED and answer.text is not None:
+            for task in tasks:
+                ballots |= {request.key for request in vote_requests(panel, task, cell, item, answer.text)}
+    answers.add(len({*keys.values()}) + len(items) - len(keys), len(rows))
+    votes.add(len(ballots) + n_new, len(workspace.votes.read(folder, ballots).settled))
+
+
+def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
+    """The number of rows of a cell's table; None unless it is fresh."""
+    state = workspace.tables.state(table, cell.partition)
+    return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
+
+
+def _items_current(lineage: Lineage, dataset: str) -> bool:
+    """Whether a dataset's items, and everything they are made from, are current."""
+    return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
+
+
+def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
+    """The partitions of a dataset's items and of what they are made from, as far as they are there."""
+    parents = lineage.graph.parents("items", dataset).items()
+    above = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
+    return [node for node in above if lineage.state(*node)]

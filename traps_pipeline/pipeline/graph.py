@@ -1,0 +1,247 @@
+"""What each partition is made from, which keys there are, and in which order.
+
+`stage` and `source` (`pipeline.stage`) are the only declarations. Nothing here imports Dagster: `traps status`,
+`why` and `plan` read this graph and the tables' footers alone, and `pipeline.assets` makes Dagster's assets of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any, Literal
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.progress import Tally
+from traps_pipeline.pipeline.partitioning import EVERY, SAME, KeyMapping, Scheme
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+Node = tuple[str, str | None]  # stage or source, and its partition key
+Need = Literal["every", "some", "none"]
+Cost = Literal["", "money", "machine"]
+# Each job and the groups of assets that it makes. Every group stands here once, in the order in which groups are made.
+JOB_GROUPS: Mapping[str, tuple[str, ...]] = {
+    "benchmark": ("benchmark", "arms"),
+    "evaluation": ("evaluation",),
+    "scoring": ("scoring", "judging", "people"),
+    "mechanism": ("mechanism",),
+    "report": ("report",),
+}
+GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check of each partition. wrong: what is wrong with it, in words or as data; empty where it passes.
+
+    blocks: nothing is made from a partition that does not pass.
+    """
+
+    name: str
+    doc: str
+    wrong: Callable[[Workspace, str | None, Made], Any]
+    blocks: bool = True
+
+
+@dataclass(frozen=True)
+class Parent:
+    """What a stage is made from. mapping: which of its partitions (default: that of the same key where both are
+    partitioned alike, else every one); need: how much of what the study wants of them must be there."""
+
+    name: str
+    mapping: KeyMapping | None = None
+    need: Need = "every"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Something that people edit. version: of its content, by partition where it has any."""
+
+    name: str
+    version: Callable[[Workspace, Any], str]
+    group: str
+    doc: str
+    kinds: Sequence[str]
+    scheme: Scheme | None = None
+
+
+@dataclass(frozen=True)
+class Takes:
+    """What a run of a stage takes of a host, for a cluster to set aside. memory_gb: 0 where it does not matter.
+    each_gb: of a stage that works on all cores that it is given (`traps run --cpus`), the memory of each besides; 0: it
+    works on one. A stage whose cost is `machine` takes a GPU besides, where `traps run --gpus` says so."""
+
+    memory_gb: float = 0.0
+    each_gb: float = 0.0
+
+
+def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
+    return Tally(), True
+
+
+@dataclass(frozen=True)
+class Shared:
+    """How several runs make one partition: the files that it names beside one another, and then one of them the
+    partition, which the others take over as made. files: makes what nobody else is at, then waits, if it is told to,
+    until nothing is missing; what was done here, and whether all is there. seconds: about how long one core works at
+    what is missing, as far as that is known before anything above is made."""
+
+    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _nothing
+    seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Makes several partitions side by side, and hands each on when it is done."""
+
+    partitions: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]]
+
+
+Make = Callable[[Workspace, Any], Made]  # makes one partition
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Something that is made: a table, or files for people (table: None).
+
+    code: raise it when the formula changes, and what was made before is stale. cost: what making it takes besides
+    seconds. wants: whether a study wants a key at all. lost: what is missing of the files that a partition names.
+    takes: what a run of it takes of a host. shared: how several runs make a partition at once, where they may.
+    """
+
+    name: str
+    table: Table | None
+    make: Make | Collect
+    group: str
+    parents: Mapping[str, Parent]
+    doc: str
+    scheme: Scheme | None
+    checks: Sequence[Check]
+    kinds: Sequence[str]
+    code: str
+    cost: Cost
+    wants: Callable[[Wanted, Any], bool]
+    lost: Callable[[Workspace, Any], list[str]]
+    takes: Takes = Takes()
+    shared: Shared | None = None
+
+    def columns(self, key: str | None) -> Mapping[str, Any]:
+        """Values of the table's partition columns for a key."""
+        return {} if self.scheme is None or key is None else self.scheme.columns(key)
+
+    def wanted(self, wanted: Wanted) -> list[str | None]:
+        """The keys that a study wants, in key order."""
+        keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(wanted)
+        return [key for key in keys if self.wants(wanted, key)]
+
+
+DECLARED: dict[str, Stage | Source] = {}  # by name; filled as `defs` is loaded
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Stages and sources, their keys, and what each partition is made from."""
+
+    declared: Mapping[str, Stage | Source] = field(default_factory=lambda: DECLARED)
+
+    @cached_property
+    def parents_of(self) -> Mapping[str, Mapping[str, Parent]]:
+        """What a stage is made from, by name; nothing for a source."""
+        return {name: one.parents if isinstance(one, Stage) else {} for name, one in self.declared.items()}
+
+    def __getitem__(self, name: str) -> Stage:
+        one = self.declared.get(name)
+        if not isinstance(one, Stage):
+            known = ", ".join(stage.name for stage in self.stages)
+            raise TrapsError(f"no stage {name!r}; choose from {known}")
+        return one
+
+    def source(self, name: str) -> Source | None:
+        """The source of that name; None for a stage."""
+        one = self.declared[name]
+        return one if isinstance(one, Source) else None
+
+    @cached_property
+    def sources(self) -> list[str]:
+        """Names of all sources."""
+        return [name for name, one in self.declared.items() if isinstance(one, Source)]
+
+    def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
+        """Stages (default: all) in order, those together that can be made in one run: they share a scheme, and nothing
+        of another scheme stands between them. Among what is ready, the groups come in the order of `GROUPS`."""
+        left = {
+            name: one
+            for name, one in self.declared.items()
+            if isinstance(one, Stage) and (names is None or name in names)
+        }
+        above = {name: {p for p in self.parents_of[name] if p in left} for name in left}
+        found: list[list[Stage]] = []
+        while left:
+            ready = [name for name in left if not above[name] & left.keys()]
+            if not ready:
+                raise TrapsError(f"the graph has a circle among {', '.join(left)}")
+            first = min(ready, key=lambda name: GROUPS.index(left[name].group))
+            scheme, block = left[first].scheme, list[Stage]()
+            while ready:
+                block += [left.pop(name) for name in ready if left[name].scheme is scheme]
+                ready = [n for n in left if left[n].scheme is scheme and not above[n] & left.keys()]
+            found.append(block)
+        return found
+
+    @cached_property
+    def stages(self) -> list[Stage]:
+        """All stages, in an order in which each finds its inputs made."""
+        return [stage for block in self.blocks() for stage in block]
+
+    def above(self, names: Iterable[str]) -> set[str]:
+        """The stages of these names, and all that they are made from."""
+        found, left = set[str](), [*names]
+        while left:
+            name = left.pop()
+            if name not in found and isinstance(self.declared[name], Stage):
+                found.add(name)
+                left += self.parents_of[name]
+        return found
+
+    def below(self, name: str) -> set[str]:
+        """The stages that are made directly from one."""
+        return {child for child, parents in self.parents_of.items() if name in parents}
+
+    @cache  # noqa: B019 - a graph lives as long as its process
+    def keys(self, name: str) -> list[str | None]:
+        """All partition keys of a stage or source."""
+        scheme = self.declared[name].scheme
+        return [None] if scheme is None else [*scheme.keys]
+
+    @cache  # noqa: B019 - a graph lives as long as its process
+    def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
+        """Every partition that a partition may be made from, whether it is there or not: keys by stage or source."""
+        scheme = self.declared[name].scheme
+        if key is not None and (scheme is None or key not in scheme.known):
+            return {}  # of an experiment that the study has no more
+        return {
+            parent.name: [None] if (above := self.declared[parent.name].scheme) is None
+            else self.mapping(name, parent.name).above(key, scheme, above)
+            for parent in self.parents_of[name].values()
+        }  # fmt: skip
+
+    def mapping(self, name: str, parent: str) -> KeyMapping:
+        """Which partitions of a partitioned parent a stage is made from."""
+        scheme, stated = self.declared[name].scheme, self.parents_of[name][parent].mapping
+        return stated or (SAME if scheme is self.declared[parent].scheme else EVERY)
+
+
+def name_of(node: Node) -> str:
+    """`stage` or `stage/key`, as footers store it."""
+    return node[0] if node[1] is None else f"{node[0]}/{node[1]}"
+
+
+@cache
+def the_graph() -> Graph:
+    """The graph of everything that is declared, once `traps_pipeline.pipeline.stages` is imported."""
+    if not DECLARED:
+        raise RuntimeError("no stage is declared yet: import traps_pipeline.pipeline.stages first")
+    return Graph()

@@ -1,0 +1,89 @@
+"""What Dagster is told of each partition and source, and what it knows: data versions and where they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.pipeline.graph import Graph, Node, Stage
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.metadata import visible_metadata
+from traps_pipeline.pipeline.translation import asset_key
+
+_VERSION, _USER, _CODE = "dagster/data_version", "dagster/data_version_is_user_provided", "dagster/code_version"
+_INPUT_VERSION, _INPUT_POINTER = "dagster/input_data_version", "dagster/input_event_pointer"
+_MADE = dg.DagsterEventType.ASSET_MATERIALIZATION
+NEVER = "INITIAL"  # Dagster's word for the version of what was never made
+
+
+class History:
+    """Dagster's history of the assets of a graph."""
+
+    def __init__(self, instance: dg.DagsterInstance, graph: Graph) -> None:
+        self._instance, self._graph = instance, graph
+
+    def event(
+        self, stage: Stage, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
+    ) -> dg.AssetMaterialization:
+        """The event that makes a partition count as made, with its data version and what it was made from."""
+        tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
+        return dg.AssetMaterialization(
+            asset_key(stage.name), partition=key, metadata=visible_metadata(metadata), tags=tags
+        )
+
+    def provenance(self, stage: Stage) -> dict[str, str]:
+        """Tags that say which events of the parents are current. Taken before anything is read."""
+        tags: dict[str, str] = {}
+        for parent in stage.parents:
+            key = asset_key(parent)
+            name = key.to_user_string()
+            found = self._fetch(parent)(dg.AssetRecordsFilter(asset_key=key), limit=1).records
+            version = _version_of(found[0]) if found else None
+            tags[f"{_INPUT_VERSION}/{name}"] = version or NEVER
+            tags[f"{_INPUT_POINTER}/{name}"] = str(found[0].storage_id) if found else "NULL"
+        return tags
+
+    def recorded(self, name: str) -> dict[str | None, str | None]:
+        """The data version that Dagster knows of each partition of a stage or source."""
+        node = self._graph.declared[name]
+        if node.scheme is None:
+            found = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
+            return {None: _version_of(found[0])} if found else {}
+        # One query over the index of tags: ten thousand events take seconds to deserialize.
+        kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MADE
+        tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])
+        return {key: of[_VERSION] for key, of in tags.items()}
+
+    def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
+        """Tell Dagster the versions of sources (default: all) that it does not know yet; returns those that changed."""
+        changed = list[Node]()
+        for name in self._graph.sources if sources is None else sources:
+            now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}
+            slot = (Path(self._instance.root_directory), name)
+            if _OBSERVED.get(slot) == now:
+                continue
+            recorded = self.recorded(name)
+            for key, version in now.items():
+                if recorded.get(key) != version:
+                    tags = {_VERSION: version, _USER: "true"}
+                    event = dg.AssetObservation(asset_key(name), partition=key, tags=tags)
+                    self._instance.report_runless_asset_event(event)
+                    changed.append((name, key))
+            _OBSERVED[slot] = now
+        return changed
+
+    def _fetch(self, name: str) -> Callable[..., dg.EventRecordsResult]:
+        source = self._graph.source(name) is not None
+        return self._instance.fetch_observations if source else self._instance.fetch_materializations
+
+
+# By history and source: versions when this process last told them. A run has many steps, and each would look again.
+_OBSERVED: dict[tuple[Path, str], dict[str | None, str]] = {}
+
+
+def _version_of(record: dg.EventLogRecord) -> str | None:
+    event = record.asset_materialization or record.asset_observation
+    return (event.tags or {}).get(_VERSION) if event else None

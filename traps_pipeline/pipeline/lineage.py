@@ -1,0 +1,171 @@
+"""What each partition was made from, and whether that is still what is there.
+
+The truth lies in the tables' footers (`storage.parquet.State`): the versions of the inputs at the time of writing. A
+partition is stale when an input's version is another now. Dagster is told the same versions, so its UI agrees; this
+module also answers where Dagster does not: unpartitioned assets, more than 100 upstream partitions, lost files, altered
+tables, failed calls.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.pipeline.graph import Graph, Stage, name_of, the_graph
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.parquet import State
+from traps_pipeline.storage.workspace import Workspace
+
+DAMAGED = "damaged"  # the version of what cannot be believed
+
+
+@dataclass(frozen=True)
+class Status:
+    """fresh, stale (with what changed, and how many calls failed) or missing."""
+
+    kind: Literal["fresh", "stale", "missing"]
+    outdated: tuple[str, ...] = ()
+    failed: int = 0
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is stale, in words."""
+        return (*self.outdated, f"{self.failed} calls failed and can be asked again") if self.failed else self.outdated
+
+
+class Lineage:
+    """A view of a workspace at one moment; versions are looked up once. thorough: every table is read whole."""
+
+    def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
+        self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
+        workspace.store.look()
+        self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
+        self._wanted = cache(lambda name: {*self.graph[name].wanted(Wanted(workspace))})
+
+    def inputs(self, stage: str, key: str | None) -> dict[str, str]:
+        """Versions of everything that is there to make a partition from, by name."""
+        nodes = [(parent, k) for parent, keys in self.graph.parents(stage, key).items() for k in keys]
+        versions = {name_of(node): self.version(*node) for node in nodes}
+        return {name: version for name, version in versions.items() if version is not None}
+
+    def status(self, name: str, key: str | None) -> Status:
+        """Whether a partition is there, whole, and made from what is there now by the code that is there now."""
+        stage = self.graph[name]
+        if damage := self.damage(name, key):
+            return Status("stale", (damage,))
+        state = self.state(name, key)
+        if state is None:
+            return Status("missing")
+        reasons = [*_differences(state.inputs, self.inputs(name, key)), *stage.lost(self._workspace, key)]
+        if state.code != stage.code:
+            reasons.append(f"its code has version {stage.code} now, it was made by version {state.code}")
+        return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
+
+    def made_at(self, name: str, key: str | None) -> int:
+        """When a partition was written (ns since 1970); 0 where there is none."""
+        stage = self.graph[name]
+        path = _report_state(self._workspace, stage)
+        if stage.table is not None:
+            path = self._workspace.tables.path(stage.table, stage.columns(key))
+        return self._workspace.store.changed_ns(path)
+
+    def blocked(self, name: str, key: str | None, *, current: bool) -> str:
+        """Why a partition cannot be made, in words; empty where it can.
+
+        current: parents must also be made from what is there now, as they are where a run has just seen to them.
+        """
+        stage = self.graph[name]
+        for parent, keys in self.graph.parents(name, key).items():
+            if self.graph.source(parent) is not None:
+                continue
+            wanted = [k for k in keys if k in self._wanted(parent)]
+            wrong = {k: why for k in wanted if (why := self._unusable(parent, k, current))}
+            need = stage.parents[parent].need
+            if need != "none" and wrong and (need == "every" or len(wrong) == len(wanted)):
+                first, why = next(iter(wrong.items()))
+                more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+                return f"{name_of((parent, first))} {why}{more}"
+            if need == "some" and not wanted:
+                return f"the study wants no {parent}"
+        return ""
+
+    def waits(self, name: str, key: str | None) -> bool:
+        """Whether something above a partition is outdated itself or must be made first: it would be made twice. What
+        costs money, and can be done without, may never come and is not waited for."""
+        of_stage = self.graph[name].parents
+        parents = {
+            parent: keys
+            for parent, keys in self.graph.parents(name, key).items()
+            if not self.graph.source(parent)
+            and not (of_stage[parent].need == "none" and self.graph[parent].cost == "money")
+        }
+        above = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
+        return any(self.status(*node).outdated for node in above) or bool(self.blocked(name, key, current=True))
+
+    def _unusable(self, name: str, key: str | None, current: bool) -> str:
+        if damage := self.damage(name, key):
+            return f"is damaged: {damage}; materialize {name} for it again"
+        status = self.status(name, key)
+        if status.kind == "missing":
+            return f"is not made; materialize {name} for this partition first"
+        if current and status.outdated:
+            return f"is not current: {status.outdated[0]}"
+        blocking = {check.name for check in self.graph[name].checks if check.blocks}
+        failed = [check for check in self._workspace.failed_checks(name, key) if check in blocking]
+        return f"does not pass its check {failed[0]}" if failed else ""
+
+    def _state(self, name: str, key: str | None) -> State | None:
+        stage = self.graph[name]
+        if stage.table is not None:
+            return self._workspace.tables.state(stage.table, stage.columns(key))
+        return read_report_state(self._workspace, stage)
+
+    def _damage(self, name: str, key: str | None) -> str:
+        stage = self.graph[name]
+        if stage.table is None:
+            return ""
+        return self._workspace.tables.damage(stage.table, stage.columns(key), thorough=self._thorough)
+
+    def _version(self, name: str, key: str | None) -> str | None:
+        source = self.graph.source(name)
+        if source is not None:
+            return source.version(self._workspace, key)
+        if self.damage(name, key):
+            return DAMAGED
+        state = self.state(name, key)
+        return state.version if state else None
+
+
+def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
+    for name in sorted(then.keys() | now.keys()):
+        if name not in now:
+            yield f"{name} is gone"
+        elif name not in then:
+            yield f"{name} is new"
+        elif then[name] != now[name]:
+            yield f"{name} changed"
+
+
+def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None:
+    """What files for people (which are no table) were made from, in a folder beside them."""
+    workspace.store.write({_report_state(workspace, stage): json.dumps(asdict(state)).encode()})
+
+
+def read_report_state(workspace: Workspace, stage: Stage) -> State | None:
+    """The state that `write_report_state` wrote; None if the files were never made."""
+    path = _report_state(workspace, stage)
+    if not workspace.store.has(path):
+        return None
+    try:
+        return State(**json.loads(workspace.store.here(path).read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise TrapsError(f"{path}: is not what was written ({error}); delete it and run again") from error
+
+
+def _report_state(workspace: Workspace, stage: Stage) -> Path:
+    return workspace.reports / ".state" / f"{stage.name}.json"

@@ -1,0 +1,90 @@
+"""Look at the machine before a run: whether it has what the stages to come need, in seconds and in one sentence."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from typing import TYPE_CHECKING
+
+from traps_pipeline.base.files import check_disk
+from traps_pipeline.base.network import check_network
+from traps_pipeline.models.judges import load_panel
+from traps_pipeline.models.registry import NETWORK, Entry, get_model
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.pipeline.graph import Stage, the_graph
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.scenes.picture.trial import OPENGL, check_rendering
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import dagster as dg
+
+LEAST_GB = 0.1  # less is gone before a run has made its first tables
+SHOWN = 5  # partitions in a sentence
+CLIPS = "mp4"  # the kind of a stage that renders
+
+Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a run is to make
+
+
+def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
+    """Return what a study wants of these stages, or one experiment of it."""
+    wanted = Wanted(workspace, experiment)
+    return {stage.name: stage.wanted(wanted) for stage in the_graph().stages if stage.name in stages}
+
+
+def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, wanted: Wanted) -> Parts:
+    """Return the stages of a Dagster run that share a step's partitions, each with those that the study wants."""
+    keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
+    selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
+    names = {key.path[-1] for key in selected}
+    alike = [other for other in the_graph().stages if other.name in names and other.scheme is stage.scheme]
+    return {other.name: [key for key in other.wanted(wanted) if key in keys] for other in alike}
+
+
+def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
+    """Return in words why a run with these keys, none of which is wanted, has nothing to make."""
+    if keys:
+        return f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:SHOWN]))}"
+    first, last = (tags.get(f"dagster/asset_partition_range_{end}", "its end") for end in ("start", "end"))
+    return f"no partition lies between {first} and {last}; exchange the two"
+
+
+def require_machine(workspace: Workspace, parts: Parts) -> None:
+    """Check what a run still needs for these partitions: disk, OpenGL and codecs, proxies and certificates.
+
+    Raises TrapsError, one sentence, for the first that is missing. A study whose clips exist needs no OpenGL, and one
+    whose answers and votes exist no network.
+    """
+    check_disk(workspace.root, LEAST_GB)
+    if any(entry.backend == NETWORK for entry in _asked(workspace, parts)):
+        check_network()
+    graph = the_graph()
+    drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
+    if any(shared is not None and shared.seconds(workspace, key) > 0 for shared, key in drawing):
+        _check_rendering(*(os.environ.get(name) for name in OPENGL))
+
+
+def _asked(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
+    """Yield the models and judges of cells whose answers or votes are not there."""
+    lineage = Lineage(workspace)
+    for name, keys in parts.items():
+        stage = the_graph()[name]
+        if stage.cost != "money" or stage.scheme is None:
+            continue
+        for key in keys:
+            if stage.table is RESPONSES:
+                entries: Iterable[Entry] = [get_model(Cell.parse(str(key)).evaluation.model)]
+            else:
+                entries = load_panel(workspace.study.panel) if workspace.study.panel else ()
+            network = [entry for entry in entries if entry.backend == NETWORK]
+            if network and lineage.status(name, key).kind != "fresh":
+                yield from network
+
+
+@cache
+def _check_rendering(*_: str | None) -> None:
+    """Check it once a process for the same variables."""
+    check_rendering()

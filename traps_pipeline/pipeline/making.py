@@ -1,0 +1,108 @@
+"""Make a stage's partitions in one run, alone or beside other runs that make the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.progress import Tally
+from traps_pipeline.base.workers import kept_workers
+from traps_pipeline.pipeline.graph import Collect, Make, Shared, Stage
+from traps_pipeline.pipeline.history import History
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.storage.leases import alone
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+
+Inputs = Mapping[str | None, Mapping[str, str]]  # versions of what each partition is made from
+
+
+class PartitionMaker:
+    """Makes partitions of a stage, each as it is done.
+
+    unmade: those that could not be made, with the reason; the others are made all the same. taken: those that another
+    run has made meanwhile, with their version and what was done here for them.
+    """
+
+    def __init__(self, workspace: Workspace, stage: Stage, history: History) -> None:
+        self._workspace, self._stage, self._history = workspace, stage, history
+        self.unmade: dict[str | None, TrapsError] = {}
+        self.taken: dict[str | None, tuple[str, Tally]] = {}
+        self._made_at: dict[str | None, int] = {}
+
+    def make(self, inputs: Inputs) -> Iterator[tuple[str | None, Made]]:
+        """Make a partition for each key of `inputs`, which were looked up before anything was read."""
+        make, shared = self._stage.make, self._stage.shared
+        if isinstance(make, Collect):
+            yield from self._side_by_side(make, [*inputs])
+        elif shared is None:
+            for key in inputs:
+                yield from self._one(make, key, Tally())
+        else:
+            yield from self._beside_others(make, shared, inputs)
+
+    def _side_by_side(self, make: Collect, keys: Sequence[str | None]) -> Iterator[tuple[str | None, Made]]:
+        pending = [*keys]
+        try:
+            for key, made in make.partitions(self._workspace, [str(key) for key in keys]) if keys else ():
+                pending.remove(key)
+                yield key, made
+        except TrapsError as error:
+            self.unmade |= dict.fromkeys(pending, error)
+
+    def _one(self, make: Make, key: str | None, tally: Tally) -> Iterator[tuple[str | None, Made]]:
+        """Make one. tally: the work that was done for it before."""
+        try:
+            made = make(self._workspace, key)
+        except TrapsError as error:
+            self.unmade[key] = error
+            return
+        made.tally.add(tally)
+        yield key, made
+
+    # --- beside other runs --------------------------------------------------------------------------------------------
+
+    def _beside_others(self, make: Make, shared: Shared, inputs: Inputs) -> Iterator[tuple[str | None, Made]]:
+        """Make files that no other run is at, then wait for theirs; who holds a partition's lease makes the partition,
+        and the others take it over."""
+        store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
+        self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
+        with kept_workers():
+            for key in inputs:
+                tally = Tally()
+                is_whole = self._make_files(shared, key, tally, wait=False)
+                lease = store.lease(f"{self._stage.name}/{key}") if is_whole else None
+                if lease is None:
+                    later[key] = tally
+                    continue
+                with closing(lease):
+                    if not self._takes_over(key, inputs[key], tally):
+                        yield from self._one(make, key, tally)
+            for key, tally in later.items():
+                if key not in self.unmade and self._make_files(shared, key, tally, wait=True):
+                    with alone(store, f"{self._stage.name}/{key}"):
+                        if not self._takes_over(key, inputs[key], tally):
+                            yield from self._one(make, key, tally)
+
+    def _make_files(self, shared: Shared, key: str | None, tally: Tally, *, wait: bool) -> bool:
+        """Make files that a partition names, add what was done to the tally, and return whether all are there."""
+        try:
+            done, is_whole = shared.files(self._workspace, key, wait)
+        except TrapsError as error:
+            self.unmade[key] = error
+            return False
+        tally.add(done)
+        return is_whole
+
+    def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
+        """Return whether another run has made a partition of the same inputs since this step began, and has told
+        Dagster of it, so that it was checked, too."""
+        stage, lineage = self._stage, Lineage(self._workspace)
+        state = lineage.state(stage.name, key)
+        if state is None or lineage.made_at(stage.name, key) == self._made_at[key]:
+            return False
+        is_told = self._history.recorded(stage.name).get(key) == state.version
+        if is_told and state.inputs == inputs and state.code == stage.code and not state.failed:
+            self.taken[key] = state.version, tally
+        return key in self.taken

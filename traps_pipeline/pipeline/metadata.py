@@ -1,0 +1,72 @@
+"""Metadata of Dagster's events, in which nothing that a model or a provider wrote can hide."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, cast
+
+import dagster as dg
+
+from traps_pipeline.base.terminal import visible
+from traps_pipeline.pipeline.graph import Stage
+from traps_pipeline.pipeline.previews import Markdown, Records, StudyFile
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+PREVIEWED = 5  # rows
+RANKED = ("pecs", "pecs_r")  # columns by which the rows of a table are better or worse
+
+
+def visible_metadata(value: Any) -> Any:
+    """Return a value of an event's metadata, or a mapping or list of them, with hidden characters made visible."""
+    if isinstance(value, str):
+        return visible(value)
+    if isinstance(value, Markdown):
+        return dg.MetadataValue.md(visible(value.text))
+    if isinstance(value, Records):
+        return dg.MetadataValue.table([dg.TableRecord(visible_metadata(row)) for row in value.rows])
+    if isinstance(value, StudyFile):
+        return dg.MetadataValue.url(value.url)
+    if isinstance(value, dg.MarkdownMetadataValue):
+        return dg.MetadataValue.md(visible(value.md_str or ""))
+    if isinstance(value, dg.TableMetadataValue):
+        records = [dg.TableRecord(visible_metadata(record.data)) for record in value.records]
+        return dg.MetadataValue.table(records, value.schema)
+    if isinstance(value, dg.MetadataValue):  # a path, a number, an asset; some are tuples
+        return value
+    if isinstance(value, Mapping):
+        return {visible_metadata(key): visible_metadata(each) for key, each in value.items()}
+    return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def partition_metadata(workspace: Workspace, stage: Stage, made: Made) -> dict[str, Any]:
+    """Return what Dagster shows of a partition or of files for people."""
+    counts: dict[str, Any] = {name: count for name, count in vars(made.tally).items() if count}
+    if stage.table is None:
+        files = cast(Mapping[str, bytes], made.content)
+        pages = {path: StudyFile(workspace.relative(workspace.reports / path)) for path in files if "/" not in path}
+        return {"files": len(files), **counts, **pages, **made.shown}
+    count = "dagster/row_count" if stage.scheme is None else "dagster/partition_row_count"
+    return {count: len(made.content), **counts, **preview(stage.table, made), **made.shown}
+
+
+def preview(table: Table, made: Made) -> dict[str, dg.TableMetadataValue]:
+    """Return rows without long texts by what they are: the best and worst where a table ranks, else the first.
+
+    What a model wrote is shown on the report's pages, where it is escaped.
+    """
+    content = cast(Any, made.content)
+    if ranked := next((name for name in RANKED if name in table.names), None):
+        ordered = made.frame.dropna(subset=[ranked]).sort_values(ranked, ascending=False, kind="stable")
+        best, worst = ordered.head(PREVIEWED), ordered.iloc[PREVIEWED:].tail(PREVIEWED)
+        shown = {f"best by {ranked}": best.to_dict("records"), f"worst by {ranked}": worst.to_dict("records")}
+    else:
+        first = content[:PREVIEWED]
+        shown = {"first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]}
+    names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
+    tables = {
+        title: [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows] for title, rows in shown.items()
+    }
+    return {title: dg.MetadataValue.table(records) for title, records in tables.items() if records}

@@ -1,0 +1,139 @@
+"""How the partitions of a group of stages are cut into ranges, one for each run.
+
+Of two dimensions a range is a rectangle of neighbours, as Dagster has them: a first and a last key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from traps_pipeline.pipeline.partitioning import Scheme
+
+Range = tuple[str | None, str | None]  # first and last key
+_Corners = tuple[int, int, int, int]  # first and last row, first and last column
+WORTH_S = 120.0  # of work that a run must find, since it costs 12 to 20 s before it does anything
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The keys of a scheme as cells of two dimensions; those of one dimension stand in a single row."""
+
+    rows: Sequence[str]
+    columns: Sequence[str]
+
+    @staticmethod
+    def of(scheme: Scheme) -> _Grid:
+        *rows, columns = scheme.dimensions.values()
+        return _Grid(rows[0] if rows else [""], columns)
+
+    def cells(self, keys: Iterable[str | None]) -> Iterator[tuple[int, int]]:
+        """Row and column of each key."""
+        row_of, column_of = ({name: n for n, name in enumerate(names)} for names in (self.rows, self.columns))
+        for key in keys:
+            row, _, column = str(key).rpartition("|")
+            yield row_of[row], column_of[column]
+
+    def range(self, top: int, bottom: int, left: int, right: int) -> Range:
+        """From one corner of a rectangle to the other; both belong to it."""
+        first, last = (self.rows[top], self.columns[left]), (self.rows[bottom], self.columns[right])
+        return "|".join(filter(None, first)), "|".join(filter(None, last))
+
+
+def batches(scheme: Scheme | None, keys: Sequence[str | None]) -> Iterator[Range]:
+    """As few ranges as there can be that together are exactly the keys."""
+    if scheme is None or not keys:
+        yield from ((key, key) for key in keys)
+        return
+    grid, by_row = _Grid.of(scheme), dict[int, list[int]]()
+    for row, column in grid.cells(keys):
+        by_row.setdefault(row, []).append(column)
+    spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
+    for (left, right), group in groupby(spans, key=lambda pair: pair[0]):
+        for top, bottom in _spans([row for _, row in group]):
+            yield grid.range(top, bottom, left, right)
+
+
+def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Maximal runs of neighbouring numbers, as (first, last)."""
+    spans: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if spans and spans[-1][1] == number - 1:
+            spans[-1] = spans[-1][0], number
+        else:
+            spans.append((number, number))
+    return spans
+
+
+# --- for several hosts ------------------------------------------------------------------------------------------------
+
+
+def cut(scheme: Scheme | None, keys: Sequence[str | None], most: int) -> list[Range]:
+    """So many ranges, or one for each key where there are fewer, that have about as many of the keys each and none
+    twice, whatever is missing between them: a range may hold other keys. Cells of one model stay together where there
+    are fewer runs than models, since each run loads its models anew; elsewhere those of one evaluation do."""
+    if scheme is None or not keys:
+        return [(key, key) for key in keys]
+    grid = _Grid.of(scheme)
+    wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
+    for row, column in grid.cells(keys):
+        wanted[row, column] = True
+    heads = np.array([name.partition("__")[0] for name in grid.columns])
+    return [grid.range(*corners) for corners in _parts(wanted, heads, 0, 0, most)]
+
+
+def _parts(
+    wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int
+) -> Iterator[tuple[int, int, int, int]]:
+    """Rectangles (first and last row, first and last column) around the wanted cells of one whose first cell has these
+    numbers. heads: the model of each column of it."""
+    rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
+    down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    wanted, heads, top, left = wanted[down, across], heads[across], top + int(rows[0]), left + int(columns[0])
+    count = min(count, int(wanted.sum()))
+    height, width = wanted.shape
+    if count == 1:
+        yield top, top + height - 1, left, left + width - 1
+        return
+    cuts = np.arange(1, width)
+    changes = cuts[heads[1:] != heads[:-1]]
+    if count <= len(changes):
+        cuts = changes
+    if width > 1:
+        at, share = _halves(wanted.sum(axis=0), cuts, {*changes.tolist()}, count)
+        yield from _parts(wanted[:, :at], heads[:at], top, left, share)
+        yield from _parts(wanted[:, at:], heads[at:], top, left + at, count - share)
+    else:
+        at, share = _halves(wanted.sum(axis=1), np.arange(1, height), set[int](), count)
+        yield from _parts(wanted[:at], heads, top, left, share)
+        yield from _parts(wanted[at:], heads, top + at, left, count - share)
+
+
+def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
+    """Where lines of these sizes are cut in two, of some places, and how many of the parts go to the first half: such
+    that the parts are of one size, else at a place that is better, else in the middle."""
+    total = int(sizes.sum())
+    first = np.cumsum(sizes)[cuts - 1]
+    shares = np.clip(np.rint(count * first / total), 1, count - 1).astype(int)
+    largest = np.maximum(first / shares, (total - first) / (count - shares))
+    found = min(range(len(cuts)), key=lambda n: (largest[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
+    return int(cuts[found]), int(shares[found])
+
+
+def shared_out(
+    scheme: Scheme | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
+) -> list[Range]:
+    """Ranges of runs that share what is to be made of each key. seconds: of work of such a run. There are so many runs,
+    of `most`, that each finds enough to do. As long as they are no more than the keys, each goes through all of them;
+    else the runs of a range go through one key, as many as its work is worth."""
+    count = max(1, min(most, int(sum(seconds.values()) / WORTH_S)))
+    if scheme is None or count <= len(keys):
+        return cut(scheme, keys, 1) * count
+    runs = dict.fromkeys(keys, 1)
+    for _ in range(count - len(keys)):
+        neediest = max(keys, key=lambda key: seconds[key] / runs[key])
+        runs[neediest] += 1
+    return [(key, key) for turn in range(max(runs.values())) for key in keys if runs[key] > turn]

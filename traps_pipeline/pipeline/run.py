@@ -1,0 +1,158 @@
+"""Walk the graph: make what is missing or stale, a Dagster run for each block of stages that share their partitions."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import dagster as dg
+import yaml
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.databases import database_error, reason_and_remedy
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, write_text
+from traps_pipeline.base.paths import require_history_path
+from traps_pipeline.models.traffic import remembering_stops
+from traps_pipeline.pipeline.graph import Stage, the_graph
+from traps_pipeline.pipeline.history import History
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host
+from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.several_hosts import several_hosts
+from traps_pipeline.storage.workspace import Workspace
+
+
+@dataclass
+class WalkResult:
+    """What a walk did: problems in sentences, among them checks that do not pass; whether a budget ended it."""
+
+    problems: list[str] = field(default_factory=list)
+    over_budget: bool = False
+    seconds: float = 0.0
+
+
+@contextmanager
+def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
+    """Dagster's history of this workspace, opened by one process at a time (a first opening by two corrupts it).
+
+    Runs whose process was killed are marked as failed: a queue would count them for ever. A history that is gone begins
+    anew, and so does one that is no history any more, which is kept beside it: what counts stands in the tables.
+    Raises TrapsError when the history cannot be read or written.
+    """
+    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    require_history_path(home)
+    try:
+        workspace.locks.mkdir(parents=True, exist_ok=True)
+        with (workspace.locks / "dagster.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            instance = _opened(workspace, home)
+        with instance:
+            for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
+                here = run.tags.get(HOST_TAG) == this_host()
+                if here and PID_TAG in run.tags and not _alive(int(run.tags[PID_TAG])):
+                    instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
+            yield instance
+    except BrokenPipeError:
+        raise  # of what is printed to
+    except Exception as error:
+        cause = database_error(error)
+        if isinstance(error, OSError):
+            why, what = error.strerror or "its file cannot be used", remedy(error)
+        elif cause is not None:
+            why, what, _ = reason_and_remedy(cause)
+        else:
+            raise
+        raise TrapsError(
+            f"{home}: Dagster's history cannot be read or written ({why}); {what} and run the same command again: "
+            "tables are whole, no answer is lost"
+        ) from error
+
+
+def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
+    from sqlalchemy.exc import DatabaseError, OperationalError
+
+    for again in (False, True):
+        if workspace.is_on_cluster and home == workspace.dagster_home:
+            settings = several_hosts().dagster_yaml(workspace)
+            write_text(home / "dagster.yaml", yaml.safe_dump(settings, sort_keys=False))
+        workspace.copy_dagster_yaml(home)
+        try:
+            instance = dg.DagsterInstance.from_config(str(home))
+            instance.get_runs_count()
+            instance.all_asset_keys()  # of the other file
+        except OperationalError:
+            raise  # a full disk or another's lock: it is whole
+        except DatabaseError as error:
+            if again or ("not a database" not in str(error) and "malformed" not in str(error)):
+                raise
+            kept = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
+            for name in ("history", "schedules", "storage"):
+                if (home / name).exists():
+                    kept.mkdir(exist_ok=True)
+                    (home / name).rename(kept / name)
+            progress.current().note(f"{home}: Dagster's history was damaged; it lies in {kept.name}, a new one begins")
+        else:
+            return instance
+    raise AssertionError("unreachable: the second try returns or raises")
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def pending_in(
+    block: Sequence[Stage], lineage: Lineage, history: History, wanted: Wanted, *, existing: bool = False
+) -> tuple[list[Stage], list[str | None]]:
+    """Return the stages of a block that have something to make, or stand below one that has, and the keys of these.
+
+    existing: only what is there already and outdated, and waits for nothing above it.
+    """
+    pending: dict[str, list[str | None]] = {}
+    for stage in block:
+        recorded = history.recorded(stage.name)
+        every = stage.wanted(wanted)
+        keys = [k for k in every if to_make(lineage, recorded, stage.name, k, existing=existing)]
+        keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
+        if keys or lineage.graph.parents_of[stage.name].keys() & pending.keys():
+            pending[stage.name] = keys
+    every = lineage.graph.keys(block[0].name)
+    return [lineage.graph[name] for name in pending], [k for k in every if any(k in keys for keys in pending.values())]
+
+
+def walk(
+    instance: dg.DagsterInstance,
+    runs: Runs,
+    workspace: Workspace,
+    stages: Collection[str],
+    *,
+    experiment: str | None = None,
+) -> WalkResult:
+    """Make what is missing or stale of these stages, block by block.
+
+    experiment: only what that one of the study's wants. KeyboardInterrupt passes through.
+    """
+    outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
+    history, wanted = History(instance, graph), Wanted(workspace, experiment)
+    tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
+    with remembering_stops():
+        for block in graph.blocks([name for name in stages if graph[name].wanted(wanted)]):
+            pending, keys = pending_in(block, Lineage(workspace), history, wanted)
+            for ran in runs.make(pending, runs.ranges(pending, keys), tags):
+                outcome.problems += ran.problems
+                outcome.over_budget |= ran.over_budget
+    outcome.problems = [*dict.fromkeys(outcome.problems)]
+    outcome.seconds = time.monotonic() - began
+    return outcome

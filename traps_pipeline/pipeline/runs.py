@@ -1,0 +1,165 @@
+"""How Dagster runs are made: here and now, one after another, or on the hosts of a cluster."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.pipeline.graph import Stage
+from traps_pipeline.pipeline.ranges import Range, batches
+from traps_pipeline.pipeline.translation import asset_key
+
+PID_TAG, HOST_TAG = "traps/pid", "traps/host"
+PARENT_TAG, ROOT_TAG = "dagster/parent_run_id", "dagster/root_run_id"
+_RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
+# Errors whose message is for people; the last one's class is imported where SQLite holds the history alone.
+_SENTENCES = (TrapsError.__name__, BudgetReached.__name__, "HistoryUnwritable")
+_INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
+_QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
+
+
+@dataclass
+class Ran:
+    """What went wrong in a run, a sentence each, and whether a budget was reached."""
+
+    problems: list[str]
+    over_budget: bool
+
+
+class Runs(ABC):
+    """Who makes runs of stages that share their partitions."""
+
+    @abstractmethod
+    def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
+        """The keys, cut into ranges that are made in one run each. A range may hold other keys too, which a run leaves
+        alone, and runs may have the same one, where they share what is to be made."""
+
+    @abstractmethod
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
+        """Make the stages in these ranges; KeyboardInterrupt passes through."""
+
+
+class RunsHere(Runs):
+    """Runs in this process, of the job of all assets. parent: the run that starts them, which their tags name; log: is
+    told of each. finished: what each run was, for the parent's metadata."""
+
+    def __init__(
+        self,
+        instance: dg.DagsterInstance,
+        job: dg.JobDefinition,
+        *,
+        parent: dg.DagsterRun | None = None,
+        log: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._instance, self._job, self._log = instance, job, log
+        ids = {PARENT_TAG: parent.run_id, ROOT_TAG: parent.root_run_id or parent.run_id} if parent else {}
+        self._tags = {PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **ids}
+        self.finished: list[dict[str, str]] = []
+
+    def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
+        """See `Runs`: as few as there can be of these keys alone."""
+        return [*batches(stages[0].scheme if stages else None, keys)]
+
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+        """See `Runs`."""
+        for number, one in enumerate(ranges, start=1):
+            run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
+            which = "" if one[0] is None else one[0] if one[0] == one[1] else f"{one[0]} to {one[1]}"
+            self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {which}")
+            ran = self._execute(stages, one, tags, run_id)
+            result = "; ".join(ran.problems) or "made"
+            self._log(f"run {run_id}: {result}")
+            self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
+            yield ran
+
+    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> Ran:
+        key = one[0] if one[0] == one[1] else None
+        try:
+            result = self._job.execute_in_process(
+                instance=self._instance,
+                asset_selection=[asset_key(stage.name) for stage in stages],
+                partition_key=key,
+                tags={**self._tags, **tags, **range_tags(one)},
+                raise_on_error=False,
+                run_config=_QUIET,
+                run_id=run_id,
+            )
+        except dg.DagsterExecutionInterruptedError:
+            raise KeyboardInterrupt from None
+        failures = [event for event in result.all_events if event.is_step_failure]
+        if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
+            raise KeyboardInterrupt
+        ran = problems_of(failures)
+        if not result.success and not ran.problems:
+            names = ", ".join(stage.name for stage in stages)
+            ran.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
+        return ran
+
+
+def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
+    """The tags of a run of a range. A single key needs none, unless Dagster is told of it in no other way (always)."""
+    first, last = one
+    if first is None or (first == last and not always):
+        return {}
+    return {_RANGE[0]: str(first), _RANGE[1]: str(last)}
+
+
+def range_of(tags: Mapping[str, str]) -> Range:
+    """The partitions of a run, by its tags: those of `range_tags`, or Dagster's own of a single key."""
+    single = tags.get("dagster/partition")
+    return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
+
+
+def this_host() -> str:
+    """Where process numbers mean what they mean here: the machine and its namespace of processes."""
+    namespace = Path("/proc/self/ns/pid")
+    return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
+
+
+def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
+    """What failed steps say."""
+    problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
+    over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
+    return Ran(problems, over)
+
+
+def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
+    """Whether a run, or a step of it that others wait for, ended for no reason that it could tell: its host, the
+    network or the database failed."""
+    named = [{error.cls_name for error in _causes(event)} for event in failures]
+    is_interrupted = any(names & {*_INTERRUPTS} for names in named)
+    unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
+    return run.status == dg.DagsterRunStatus.FAILURE and unnamed and not is_interrupted
+
+
+def _causes(event: dg.DagsterEvent) -> list[Any]:
+    """The error of a failed step and its causes, outermost first."""
+    return _chain(event.step_failure_data.error)
+
+
+def _chain(error: Any) -> list[Any]:
+    chain = []
+    while error is not None:
+        chain.append(error)
+        error = error.cause
+    return chain
+
+
+def reason(error: Any) -> str:
+    """What an error that Dagster wrote down says: our own sentences where there are some, else its innermost cause."""
+    chain = _chain(error)
+    readable = [one for one in chain if one.cls_name in _SENTENCES]
+    if not readable:
+        return chain[-1].message.strip() if chain else "the step failed"
+    return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

@@ -1,0 +1,113 @@
+"""What a run is asked to make, and whether anything of it is to be made, from tables' footers alone.
+
+Nothing here imports Dagster or opens its history: `traps run` with nothing to do ends before it would.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.pipeline.graph import name_of, the_graph
+from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.workspace import Workspace
+
+_NOTE = "last_run.json"
+_HISTORY = Path("history", "runs", "index.db")  # of Dagster's SQLite storage, below its folder; holds every event
+
+
+def stages_until(until: str | None) -> set[str]:
+    """All stages; with `until` (names with commas between), these and what they are made from. Raises TrapsError."""
+    graph = the_graph()
+    if until is None:
+        return {stage.name for stage in graph.stages}
+    known = [stage.name for stage in graph.stages]
+    if unknown := [name for name in until.split(",") if name not in known]:
+        raise TrapsError(f"--until {', '.join(unknown)}: no such stage; choose from {', '.join(known)}")
+    return graph.above(until.split(","))
+
+
+def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
+    """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
+    wanted, graph = Wanted(workspace, experiment), the_graph()
+    if not wanted.cells and not wanted.states:
+        raise TrapsError(
+            f"experiment {experiment} asks nothing: none of its scenarios belongs to its datasets, or no model has its "
+            "runs; change `scenarios`, `datasets` or `runs`"
+        )
+    if empty := [name for name in until.split(",") if not graph[name].wanted(wanted)] if until else []:
+        raise TrapsError(f"--until {', '.join(empty)}: experiment {experiment} wants nothing of it; name another stage")
+
+
+def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
+    """Checks of what is wanted that do not pass, whichever run made it."""
+    wanted, problems = Wanted(workspace, experiment), []
+    for stage in the_graph().stages:
+        for key in stage.wanted(wanted):
+            for check in workspace.failed_checks(stage.name, key):
+                details = workspace.failure(stage.name, check, key)
+                problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
+    return problems
+
+
+def _unquoted(details: str) -> str:
+    return details[1:-1] if details[:1] == details[-1:] == '"' else details
+
+
+# --- nothing to do ----------------------------------------------------------------------------------------------------
+
+
+def note_versions(workspace: Workspace, stages: Collection[str], experiment: str | None) -> None:
+    """Write down, after a run without problems, which versions Dagster's history holds, and what state it is in."""
+    if (history := _history_state(workspace)) is None:
+        return
+    lineage, wanted = Lineage(workspace), Wanted(workspace, experiment)
+    graph = lineage.graph
+    versions = {
+        name_of((name, key)): lineage.version(name, key)
+        for name in sorted(stages)
+        for key in graph[name].wanted(wanted)
+    }
+    former = _read_note(workspace)
+    if former.get("history") == history:  # of other stages or another experiment: Dagster holds these too
+        versions = former["versions"] | versions
+    note = json.dumps({"history": history, "versions": versions})
+    workspace.store.write({workspace.dagster_home / _NOTE: note.encode()})
+
+
+def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: str | None) -> bool:
+    """Whether every wanted partition is fresh and known to Dagster, whose history is as the last run left it."""
+    note = _read_note(workspace)
+    if not note or note.get("history") != _history_state(workspace):
+        return False
+    lineage, wanted, known = Lineage(workspace), Wanted(workspace, experiment), note["versions"]
+    return all(
+        known.get(name_of((name, key))) == lineage.version(name, key) is not None
+        and lineage.status(name, key).kind == "fresh"
+        for name in stages
+        for key in lineage.graph[name].wanted(wanted)
+    )
+
+
+def _read_note(workspace: Workspace) -> dict[str, Any]:
+    path = workspace.dagster_home / _NOTE
+    try:
+        note = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return note if isinstance(note, dict) and isinstance(note.get("versions"), dict) else {}
+
+
+def _history_state(workspace: Workspace) -> list[Any] | None:
+    """Where Dagster's history lies, and the size and time of its files; None where it is no file of this machine."""
+    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    index = home / _HISTORY
+    if workspace.is_shared or not index.is_file():
+        return None
+    states = [path.stat() for path in (index, index.with_name(index.name + "-wal")) if path.exists()]
+    return [str(home.resolve()), *([state.st_size, state.st_mtime_ns] for state in states if state.st_size)]

@@ -1,0 +1,118 @@
+"""The one declaration of a stage or source: what people edit, and what is made of it.
+
+`stage(...)` declares a table (or files for people), `source(...)` something that people edit. `pipeline.assets`
+makes Dagster's assets of them, and `pipeline.step` their partitions.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from functools import cache
+from typing import Any
+
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.paths import PACKAGE
+from traps_pipeline.pipeline.graph import (
+    DECLARED,
+    GROUPS,
+    Check,
+    Collect,
+    Cost,
+    Make,
+    Need,
+    Parent,
+    Shared,
+    Source,
+    Stage,
+    Takes,
+)
+from traps_pipeline.pipeline.partitioning import KeyMapping, Scheme
+from traps_pipeline.pipeline.schemes import LEFT_OUT
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+# Stages of these groups take seconds: their code version follows every file of these rooms. Others cost money or take
+# long, and state one that is raised by hand.
+_FOLLOWED = {"report": ("report",)} | dict.fromkeys(("scoring", "judging", "people"), ("judging", "scoring", "people"))
+
+
+@cache
+def code_of(group: str) -> str:
+    """Return the code version of a group's stages that take no money and little time."""
+    paths = [path for room in _FOLLOWED.get(group, ()) for path in sorted((PACKAGE / room).rglob("*"))]
+    files = [path for path in paths if path.is_file() and path.suffix != ".pyc"]
+    return digest({path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in files})[:12] if files else "1"
+
+
+def is_declared(name: str) -> bool:
+    """Whether a stage or source, declared before, is part of the study's graph."""
+    return name in DECLARED
+
+
+def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: Need = "every") -> Parent:
+    """Return a parent of a stage, by which of its partitions and how much of them it needs."""
+    return Parent(parent if isinstance(parent, str) else parent.name, mapping, need)
+
+
+def source(
+    name: str,
+    version: Callable[[Workspace, Any], str],
+    *,
+    group: str,
+    doc: str,
+    kinds: Sequence[str],
+    scheme: Scheme | None = None,
+) -> Source:
+    """Declare something that people edit; its data version, by partition where it has any, is made from its content."""
+    one = Source(name, version, group, doc, kinds, scheme)
+    _declare(one)
+    return one
+
+
+def stage(
+    table: Table | str,
+    make: Make | Collect,
+    *,
+    group: str,
+    parents: Sequence[Parent | Stage | Source],
+    scheme: Scheme | None = None,
+    code: str = "",
+    cost: Cost = "",
+    checks: Sequence[Check] = (),
+    kinds: Collection[str] = ("parquet",),
+    wants: Callable[[Wanted, Any], bool] = lambda wanted, key: True,
+    lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
+    takes: Takes | None = None,
+    shared: Shared | None = None,
+) -> Stage:
+    """Declare a table, or files for people where only a name is given (see `graph.Stage` for the parameters).
+
+    The description is the docstring of what makes it; the code is `code_of` the group, unless stated.
+    """
+    function = make.partitions if isinstance(make, Collect) else make
+    above = [one if isinstance(one, Parent) else of(one) for one in parents]
+    one = Stage(
+        name=table if isinstance(table, str) else table.name,
+        table=None if isinstance(table, str) else table,
+        make=make,
+        group=group,
+        parents={parent.name: parent for parent in above},
+        doc=" ".join((function.__doc__ or "").split()),
+        scheme=scheme,
+        checks=checks,
+        kinds=[*kinds],
+        code=code or ("1" if cost else code_of(group)),
+        cost=cost,
+        wants=wants,
+        lost=lost,
+        takes=takes or Takes(),
+        shared=shared,
+    )
+    _declare(one)
+    return one
+
+
+def _declare(one: Stage | Source) -> None:
+    if one.group not in GROUPS:
+        raise ValueError(f"{one.name}: no job makes the group {one.group}; add it to JOB_GROUPS")
+    if one.group not in LEFT_OUT:
+        DECLARED[one.name] = one

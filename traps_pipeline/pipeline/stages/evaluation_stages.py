@@ -1,0 +1,156 @@
+"""The evaluation group: answers of models, votes of judges, verdicts of the panel. A cell is dataset x evaluation."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, cast
+
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
+from traps_pipeline.judging.panel import collect_votes
+from traps_pipeline.models.answers import collect_answers
+from traps_pipeline.models.judges import panel_version
+from traps_pipeline.models.prompts import prompt_version
+from traps_pipeline.models.reading import READING
+from traps_pipeline.models.registry import answering_version
+from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES, ResponseRow
+from traps_pipeline.pipeline.graph import Check, Collect
+from traps_pipeline.pipeline.previews import Records, StudyFile
+from traps_pipeline.pipeline.schemes import CELL, EVALUATION, by_dataset, by_evaluation
+from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stages.benchmark_stages import items
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+
+GROUP = "evaluation"
+MAX_INVALID_SHARE = 0.05
+ITEMS_SHOWN = 40
+models = source(
+    "models",
+    lambda workspace, key: answering_version(Evaluation.parse(key)),
+    group=GROUP,
+    doc="assets/models.yaml: the settings that a model's answers depend on, by evaluation.",
+    kinds=["yaml"],
+    scheme=EVALUATION,
+)
+prompts = source(
+    "prompts",
+    lambda workspace, key: prompt_version(
+        Evaluation.parse(key).regime, {d for asked in workspace.study.experiments.values() for d in asked.datasets}
+    ),
+    group=GROUP,
+    doc="assets/prompts: the regime's system prompt, by evaluation.",
+    kinds=["text"],
+    scheme=EVALUATION,
+)
+judges = source(
+    "judges",
+    lambda workspace, key: panel_version(workspace.study.panel),
+    group=GROUP,
+    doc="assets/judges.yaml and the judges' prompts: the study's panel.",
+    kinds=["yaml"],
+)
+
+
+def _collect_answers(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+    """Answers of a model under a regime in a run, one row per item; answers in the ledger are not asked again."""
+    return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
+
+
+def _collect_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+    """Votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
+    return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
+
+
+def _with_items(workspace: Workspace, cells: Iterator[tuple[Cell, Made]]) -> Iterator[tuple[str | None, Made]]:
+    """Add a cell's items to what is shown of it."""
+    for cell, made in cells:
+        shown = {**made.shown, **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], made.content))}
+        yield cell.key, Made(made.content, made.tally, shown)
+
+
+def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
+    """Metadata about a cell's items: a table of those without an answer, and the page of all."""
+    from traps_pipeline.report.cell_pages import FOLDER, page_name
+
+    page = workspace.reports / FOLDER / page_name(cell)
+    columns = ("item_id", "side", "outcome", "error", "attempts")
+    without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
+    records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
+    table = {"without an answer": Records(records)} if records else {}
+    why = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
+    return {**table, "all items": StudyFile(workspace.relative(page)), **why}
+
+
+def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
+    state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
+    n_items = state.rows if state else 0
+    n_rows = len(made.rows(RESPONSES))
+    return "" if n_rows == n_items else f"{n_rows} rows for {n_items} items"
+
+
+responses = stage(
+    RESPONSES,
+    Collect(_collect_answers),
+    group=GROUP,
+    parents=[
+        of(items, by_dataset),
+        of(models, by_evaluation),
+        of(prompts, by_evaluation),
+    ],
+    scheme=CELL,
+    code=f"3.{READING}",
+    cost="money",
+    checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
+)
+
+
+def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
+    cast_votes = made.rows(VOTES)
+    invalid = sum(not vote.valid for vote in cast_votes)
+    many = invalid > MAX_INVALID_SHARE * len(cast_votes)
+    return f"{invalid} of {len(cast_votes)} votes are invalid" if many else ""
+
+
+votes = stage(
+    VOTES,
+    Collect(_collect_votes),
+    group=GROUP,
+    parents=[of(items, by_dataset), responses, judges],
+    scheme=CELL,
+    code="3",
+    cost="money",
+    checks=[
+        Check(
+            "few_invalid_votes",
+            f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema or are unread.",
+            _many_invalid,
+            blocks=False,
+        )
+    ],
+)
+
+
+def _make_verdicts(workspace: Workspace, key: str) -> Made:
+    """The verdict of the panel's majority on each item of a cell."""
+    from traps_pipeline.judging.verdicts import decide_cell
+
+    rows = decide_cell(workspace, Cell.parse(key))
+    return Made(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
+
+
+def _verdicts_missing(workspace: Workspace, key: str | None, made: Made) -> str:
+    answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
+    n_answers = answered.rows if answered else 0
+    return "" if n_answers == len(made.frame) else f"{len(made.frame)} verdicts for {n_answers} answers"
+
+
+verdicts = stage(
+    VERDICTS,
+    _make_verdicts,
+    group=GROUP,
+    parents=[of(items, by_dataset), responses, votes, judges],
+    scheme=CELL,
+    code="3",
+    checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
+)

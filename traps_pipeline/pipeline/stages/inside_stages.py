@@ -1,0 +1,178 @@
+"""The controls of the mechanism group: baselines of probes, the gate, nulls of steering, patching."""
+
+from typing import TYPE_CHECKING
+
+from traps_pipeline.mechanism.control_rows import (
+    GATE,
+    PATCHING,
+    PROBE_BASELINES,
+    RISK_COVERAGE,
+    STEERING_NULLS,
+    STEERING_PECS,
+)
+from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
+from traps_pipeline.mechanism.probing_versions import patching_version
+from traps_pipeline.models.registry import ModelEntry, local_models
+from traps_pipeline.pipeline.partitioning import EVERY, SAME
+from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys
+from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stages.evaluation_stages import verdicts
+from traps_pipeline.pipeline.stages.mechanism_stages import (
+    ANSWERED,
+    GROUP,
+    hidden_states,
+    probe_items,
+    probes,
+    probing_settings,
+    steering_effects,
+    steers,
+)
+from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.mechanism.stored import StoredStates
+
+patching_settings = source(
+    "patching_settings",
+    lambda workspace, key: patching_version(workspace, Extraction.parse(key)),
+    group=GROUP,
+    doc="The inputs of patching besides items: checkpoint, precision, prompt, pairs and sites.",
+    kinds=["yaml"],
+    scheme=EXTRACTION,
+)
+
+
+def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
+    """The model of an extraction, and its stored states."""
+    from traps_pipeline.mechanism.stages import examined_model
+    from traps_pipeline.mechanism.stored import StoredStates
+
+    extraction = Extraction.parse(key)
+    return examined_model(workspace, extraction.model), StoredStates.of(workspace, extraction)
+
+
+def _make_baselines(workspace: Workspace, key: str) -> Made:
+    """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
+    from traps_pipeline.mechanism.baselines import baseline_rows
+
+    return Made(baseline_rows(workspace, *_examined(workspace, key)))
+
+
+probe_baselines = stage(
+    PROBE_BASELINES,
+    _make_baselines,
+    group=GROUP,
+    code="2",
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(probe_items, EVERY),
+        of(verdicts, ANSWERED, need="none"),
+        probing_settings,
+    ],
+    scheme=EXTRACTION,
+    kinds=["parquet", "scikitlearn"],
+    cost="machine",  # the output margin needs the model's head
+    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
+)
+
+
+def _make_gate(workspace: Workspace, key: str) -> Made:
+    """The model's figures before and after a probe on its states has turned answers into abstentions, beside gates on
+    raw inputs, on the output margin and with shuffled labels."""
+    from traps_pipeline.mechanism.gating import gate_rows
+
+    return Made(gate_rows(workspace, *_examined(workspace, key)))
+
+
+def _make_curves(workspace: Workspace, key: str) -> Made:
+    """Risk against coverage as gates give up answers, over the four datasets."""
+    from traps_pipeline.mechanism.gating import curve_rows
+
+    return Made(curve_rows(workspace, *_examined(workspace, key)))
+
+
+def _gated(wanted: Wanted, key: str) -> bool:
+    """Whether the model of an extraction is asked, so that there are answers to gate."""
+    extraction = Extraction.parse(key)
+    asked = {(e.model, e.regime) for e in wanted.evaluations}
+    return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in asked for r in PROMPTING)
+
+
+_ASKED = (*DATASETS, *PROBED_ARMS)
+_GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in PROMPTING])
+_OF_GATE = [
+    of(hidden_states, by_extraction, need="some"),
+    of(probe_items, EVERY),
+    of(probes, SAME),
+    of(verdicts, _GATED, need="some"),
+    probing_settings,
+]
+gate = stage(
+    GATE,
+    _make_gate,
+    group=GROUP,
+    parents=_OF_GATE,
+    scheme=EXTRACTION,
+    wants=_gated,
+    cost="machine",
+)
+risk_coverage = stage(
+    RISK_COVERAGE,
+    _make_curves,
+    group=GROUP,
+    parents=_OF_GATE,
+    scheme=EXTRACTION,
+    wants=_gated,
+    cost="machine",
+)
+
+
+def _make_patching(workspace: Workspace, key: str) -> Made:
+    """Indirect effects of groups of positions between matched controls and voids, at every layer, beside nulls."""
+    from traps_pipeline.mechanism.patched import patching_rows
+    from traps_pipeline.mechanism.stages import examined_model
+
+    extraction = Extraction.parse(key)
+    return Made(patching_rows(workspace, examined_model(workspace, extraction.model), extraction))
+
+
+patching = stage(
+    PATCHING,
+    _make_patching,
+    group=GROUP,
+    parents=[of(probe_items, EVERY, need="some"), patching_settings],
+    scheme=EXTRACTION,
+    wants=lambda wanted, key: wanted.patches and Extraction.parse(key).prompt == PROBE_PROMPT,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+)
+
+
+def _make_nulls(workspace: Workspace, _: None) -> Made:
+    """The effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.nulls import null_rows
+
+    table = pd.DataFrame(null_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_NULLS.names))
+    return Made(table, shown={"nulls": rows_shown(table)})
+
+
+def _make_steering_pecs(workspace: Workspace, _: None) -> Made:
+    """PECS of the steered model under each sign policy, with the share of degenerate answers."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.nulls import pecs_rows
+
+    table = pd.DataFrame(pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_PECS.names))
+    return Made(table, shown={"pecs": rows_shown(table)})
+
+
+steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, parents=[steering_effects], wants=steers)
+steering_pecs = stage(STEERING_PECS, _make_steering_pecs, group=GROUP, parents=[steering_effects], wants=steers)

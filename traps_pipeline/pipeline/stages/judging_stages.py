@@ -1,0 +1,142 @@
+"""The judging group: agreement of the panel, bias of its judges, and confabulation in void failures."""
+
+from typing import TYPE_CHECKING
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
+from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
+from traps_pipeline.pipeline.graph import Check
+from traps_pipeline.pipeline.schemes import CELL, these_keys
+from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stages.benchmark_stages import items
+from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
+from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
+from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+GROUP = "judging"
+
+
+def _validation_version(workspace: Workspace, key: None) -> str:
+    state = workspace.tables.state(JUDGE_VALIDATION, {})
+    return state.version if state else "not run"
+
+
+confabulation_protocol = source(
+    "confabulation_protocol",
+    lambda workspace, key: protocol_digest(workspace.study.panel),
+    group=GROUP,
+    doc="assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels.",
+    kinds=["yaml"],
+)
+judge_validation = source(
+    "judge_validation",
+    _validation_version,
+    group=GROUP,
+    doc="The comparison of the judge with two annotators, which `traps confabulation validate` writes.",
+    kinds=["parquet"],
+)
+_SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
+
+
+def _panel(workspace: Workspace) -> list[str]:
+    from traps_pipeline.models.judges import load_panel
+
+    return [judge.id for judge in load_panel(workspace.study.panel)]
+
+
+def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
+    """The votes of the study's panel as it is now. Raises TrapsError if there is none."""
+    from traps_pipeline.judging.ratings import VOTE_COLUMNS
+    from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.models.judges import panel_id
+
+    votes = current(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
+    votes = votes.loc[votes["panel"] == panel_id(workspace.study.panel)]
+    if votes.empty:
+        raise TrapsError(f"{name}: no votes yet; materialize votes for a cell first")
+    return votes
+
+
+def _shown(name: str, frame: "pd.DataFrame") -> Made:
+    return Made(frame, shown={name: rows_shown(frame)})
+
+
+def _make_agreement(workspace: Workspace, _: None) -> Made:
+    """Agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
+    Krippendorff."""
+    from traps_pipeline.judging.agreement import agreement
+
+    return _shown("agreement", agreement(_votes(workspace, "agreement"), _panel(workspace)))
+
+
+def _make_judge_bias(workspace: Workspace, _: None) -> Made:
+    """Each judge's rate of yes against the panel's majority, per dataset and task."""
+    from traps_pipeline.judging.agreement import judge_bias
+
+    return _shown("judge bias", judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
+
+
+def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
+    """PECS by the votes of two judges, for each judge that is left out."""
+    from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.scoring.leave_one_out import leave_one_out
+
+    cast, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
+    return _shown("leave one out", leave_one_out(current(workspace, VERDICTS), cast, board, _panel(workspace)))
+
+
+def _make_confabulation(workspace: Workspace, _: None) -> Made:
+    """Void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no such
+    judge."""
+    from traps_pipeline.judging.confabulation import collect_labels
+
+    return collect_labels(workspace)
+
+
+def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
+    labels = made.rows(CONFABULATION)
+    invalid = sum(not label.valid for label in labels)
+    return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
+
+
+def _make_prevalence(workspace: Workspace, _: None) -> Made:
+    """How often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
+    from traps_pipeline.scoring.prevalence import prevalence
+
+    return _shown("prevalence", prevalence(workspace.tables.read(CONFABULATION, {})))
+
+
+_VOTED = (of(items, need="some"), of(votes, need="some"), judges)
+agreement = stage(AGREEMENT, _make_agreement, group=GROUP, parents=_VOTED)
+judge_bias = stage(JUDGE_BIAS, _make_judge_bias, group=GROUP, parents=_VOTED)
+leave_one_out = stage(
+    LEAVE_ONE_OUT, _make_leave_one_out, group=GROUP, parents=[*_VOTED, of(verdicts, need="some"), leaderboard]
+)
+confabulation = stage(
+    CONFABULATION,
+    _make_confabulation,
+    group=GROUP,
+    parents=[
+        of(items, need="none"),
+        of(responses, _SAMPLED, need="none"),
+        of(verdicts, _SAMPLED, need="none"),
+        confabulation_protocol,
+    ],
+    code="2",
+    cost="money",
+    checks=[
+        Check(
+            "few_invalid_labels",
+            f"At most {MAX_INVALID_SHARE:.0%} of the labels break the schema.",
+            _many_invalid,
+            blocks=False,
+        )
+    ],
+)
+confabulation_prevalence = stage(CONFABULATION_PREVALENCE, _make_prevalence, group=GROUP, parents=[confabulation])

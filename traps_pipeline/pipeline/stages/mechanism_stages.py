@@ -1,0 +1,295 @@
+"""The mechanism group: hidden states of local models, probes, void directions, steering (docs/spec.md 7 and 8)."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from traps_pipeline.base.progress import Tally
+from traps_pipeline.mechanism.mechanism_rows import (
+    COSINES,
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING_EFFECTS,
+    STEERING_SHARES,
+    STEERING_VOTES,
+    ProbeRow,
+)
+from traps_pipeline.mechanism.mechanism_rows import STEERING as STEERING_TABLE
+from traps_pipeline.mechanism.probing_versions import (
+    directions_are_there,
+    extraction_version,
+    probing_version,
+    states_are_there,
+    steering_version,
+)
+from traps_pipeline.models.registry import local_models
+from traps_pipeline.pipeline.graph import Check, Collect, Takes
+from traps_pipeline.pipeline.partitioning import EVERY
+from traps_pipeline.pipeline.schemes import (
+    CATEGORY,
+    CELL,
+    DATASET,
+    EXTRACTION,
+    PROBED,
+    STATES,
+    STEERED,
+    STEERING,
+    by_dataset,
+    by_extraction,
+    by_steering,
+    these_keys,
+    to_keys,
+)
+from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
+from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
+from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+GROUP = "mechanism"
+extraction_settings = source(
+    "extraction_settings",
+    lambda workspace, key: extraction_version(workspace, Extraction.parse(key)),
+    group=GROUP,
+    doc="The inputs of hidden states besides items: checkpoint, precision, prompt.",
+    kinds=["yaml"],
+    scheme=EXTRACTION,
+)
+probing_settings = source(
+    "probing_settings",
+    lambda workspace, key: probing_version(workspace, Extraction.parse(key)),
+    group=GROUP,
+    doc="The study's settings of probes and directions, by model.",
+    kinds=["yaml"],
+    scheme=EXTRACTION,
+)
+steering_settings = source(
+    "steering_settings",
+    steering_version,
+    group=GROUP,
+    doc="The study's settings of steering, the model and its prompt.",
+    kinds=["yaml"],
+    scheme=STEERED,
+)
+# Cells in which the local models answered under Standard in run 1: their verdicts say what the models confabulated on.
+ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
+_OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
+
+
+def _probed_from(dataset: str) -> list[str]:
+    return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
+
+
+def steers(wanted: Wanted, key: str | None) -> bool:
+    """Whether the study steers models."""
+    return wanted.steers
+
+
+def _make_probe_items(workspace: Workspace, dataset: str) -> Made:
+    """Clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with a
+    question that they answer, and chaotic's clips with the frame times of the other side."""
+    from traps_pipeline.mechanism.probe_items import probe_items as rows_of
+
+    return Made(rows_of(workspace, dataset))
+
+
+probe_items = stage(
+    PROBE_ITEMS,
+    _make_probe_items,
+    group=GROUP,
+    code="2",
+    parents=[
+        of(items, to_keys(DATASET, PROBED, _probed_from)),
+        of(scene_specs, _OCCLUSION),
+        of(videos, _OCCLUSION),
+    ],
+    scheme=PROBED,
+)
+
+
+def _make_hidden_states(workspace: Workspace, key: str) -> Made:
+    """Hidden states of a frozen local model at every layer, one row per item; only missing states are extracted."""
+    from traps_pipeline.mechanism.stages import extract_states
+
+    rows, new = extract_states(workspace, StatesCell.parse(key))
+    return Made(rows, Tally(asked=new), {"extracted": new})
+
+
+def _unsound_layers(workspace: Workspace, key: str | None, made: Made) -> list[int]:
+    from traps_pipeline.mechanism.stages import unsound_layers
+
+    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows(HIDDEN_STATES)[0].n_layers)
+
+
+hidden_states = stage(
+    HIDDEN_STATES,
+    _make_hidden_states,
+    group=GROUP,
+    parents=[
+        of(probe_items, by_dataset),
+        of(extraction_settings, by_extraction),
+    ],
+    scheme=STATES,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+    lost=lambda workspace, key: [] if states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"],
+    checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
+)
+
+
+def _make_probes(workspace: Workspace, key: str) -> Made:
+    """Probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
+    from traps_pipeline.mechanism.stages import probe_rows
+
+    return Made(probe_rows(workspace, Extraction.parse(key)))
+
+
+def _outside_shares(workspace: Workspace, key: str | None, made: Made) -> str:
+    def is_wrong(row: ProbeRow) -> bool:
+        figures = (row.value, row.low, row.high)
+        return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
+
+    wrong = sum(is_wrong(row) for row in made.rows(PROBES))
+    return f"{wrong} rows are wrong" if wrong else ""
+
+
+probes = stage(
+    PROBES,
+    _make_probes,
+    group=GROUP,
+    code="2",
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(verdicts, ANSWERED, need="none"),
+        probing_settings,
+    ],
+    scheme=EXTRACTION,
+    kinds=["parquet", "scikitlearn"],
+    takes=Takes(memory_gb=1.0, each_gb=0.5),
+    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
+    checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
+)
+
+
+def _make_directions(workspace: Workspace, key: str) -> Made:
+    """The void direction of every dataset at every layer, with draws of its nulls, as files."""
+    from traps_pipeline.mechanism.stages import direction_rows
+
+    return Made(direction_rows(workspace, Extraction.parse(key)))
+
+
+directions = stage(
+    DIRECTIONS,
+    _make_directions,
+    group=GROUP,
+    code="2",
+    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
+    scheme=EXTRACTION,
+    wants=steers,
+    lost=lambda workspace, key: (
+        [] if directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
+    ),
+)
+
+
+def _make_cosines(workspace: Workspace, _: None) -> Made:
+    """Cosines of every two void directions of a model at one layer."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.stages import cosine_rows
+
+    table = pd.DataFrame(cosine_rows(workspace))
+    return Made(table, shown={"cosines": rows_shown(table)})
+
+
+cosines = stage(COSINES, _make_cosines, group=GROUP, parents=[of(directions, need="some")], wants=steers)
+
+
+def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+    """Answers of a model that is steered along every path into a dataset; answers in the ledger are not asked again."""
+    from traps_pipeline.mechanism.stages import examined_model, saved_directions
+    from traps_pipeline.mechanism.steering import collect_steered
+
+    for key in keys:
+        cell = SteeringCell.parse(key)
+        entry = examined_model(workspace, cell.evaluation.model)
+        along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
+        for done, made in collect_steered(workspace, entry, [cell], along):
+            yield done.key, made
+
+
+steering = stage(
+    STEERING_TABLE,
+    Collect(_collect_steering),
+    group=GROUP,
+    code="3",
+    parents=[
+        of(items, by_dataset),
+        of(directions, EVERY, need="some"),
+        of(steering_settings, by_steering),
+    ],
+    scheme=STEERING,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+)
+
+
+def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+    """The votes of the study's panel on whether each steered answer abstains, and whether a control's is correct."""
+    from traps_pipeline.mechanism.steering import collect_steering_votes
+
+    for done, made in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield done.key, made
+
+
+steering_votes = stage(
+    STEERING_VOTES,
+    Collect(_collect_steering_votes),
+    group=GROUP,
+    code="3",
+    parents=[of(items, by_dataset), steering, judges],
+    scheme=STEERING,
+    cost="money",
+)
+
+
+def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
+    """The steered answers, and the votes on them."""
+    from traps_pipeline.mechanism.shares import VOTE_COLUMNS
+
+    return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)
+
+
+def _make_effects(workspace: Workspace, _: None) -> Made:
+    """Abstention by path, kind of direction, layer, strength and side."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.shares import effect_rows
+
+    table = pd.DataFrame(effect_rows(*_judged(workspace)), columns=pd.Index(STEERING_EFFECTS.names))
+    return Made(table, shown={"effects": rows_shown(table)})
+
+
+def _make_shares(workspace: Workspace, _: None) -> Made:
+    """Abstention over the paths of a set, with intervals by scenario."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.shares import share_rows
+
+    table = pd.DataFrame(share_rows(*_judged(workspace)), columns=pd.Index(STEERING_SHARES.names))
+    return Made(table, shown={"shares": rows_shown(table)})
+
+
+_ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", parents=_ABOVE, wants=steers)
+
+
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="3", parents=_ABOVE, wants=steers)

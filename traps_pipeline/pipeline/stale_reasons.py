@@ -1,0 +1,100 @@
+"""`traps why`: which answers to an item are still valid, and which would be asked again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.judging.judging_rows import VOTES
+from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+# Without the times of calls, for which pyarrow would import pandas.
+_OF_ANSWER = ("item_id", "text", "error", "outcome")
+_OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "rationale", "invalid_reason")
+
+
+def why(workspace: Workspace, item_id: str) -> Iterator[str]:
+    """For every evaluation that has asked the item: whether its answer is still valid, or which component of the key
+    changed, with the answer and its votes. Before them the item's question and clip. Raises TrapsError for an unknown
+    item."""
+    dataset = item_id.split(":")[0]
+    current = _current_item(workspace, dataset, item_id)
+    n_asked = 0
+    if current is not None:
+        yield f"question: {current['question']}"
+        yield f"ground truth: {current['ground_truth'] if current['side'] == 'control' else 'none, it is void'}"
+        yield f"clip: {workspace.resolve(current['clip'])}"
+    for model, entry in load_models().items():
+        for regime in REGIMES:
+            for run in range(1, entry.runs + 1):
+                evaluation = Evaluation(model, regime, run)
+                rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
+                if not rows:
+                    continue
+                n_asked += 1
+                wanted = answer_request(workspace, entry, current, evaluation) if current else None
+                yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
+                yield from _judged(workspace, Cell(dataset, evaluation), item_id)
+    if current is None and not n_asked:
+        raise TrapsError(
+            f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
+        )
+    if not n_asked:
+        yield "no model has been asked this item"
+
+
+def _judged(workspace: Workspace, cell: Cell, item_id: str) -> Iterator[str]:
+    """The answer to an item as its table has it, and the votes on it."""
+    for answer in _rows_of(workspace, RESPONSES, _OF_ANSWER, cell, item_id):
+        said = _short(answer["text"]) if answer["text"] else answer["error"] or ""
+        yield f"    {answer['outcome']}: {said}"
+    for vote in _rows_of(workspace, VOTES, _OF_VOTE, cell, item_id):
+        decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
+        word = "invalid" if not vote["valid"] else "yes" if decision else "no"
+        yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
+
+
+def _rows_of(
+    workspace: Workspace, table: Table, columns: Sequence[str], cell: Cell, item_id: str
+) -> list[dict[str, Any]]:
+    if workspace.tables.state(table, cell.partition) is None:
+        return []
+    return [row for row in workspace.tables.records(table, cell.partition, columns) if row["item_id"] == item_id]
+
+
+def _about(row: Mapping[str, Any]) -> Any:
+    return row["components"]["about"]["item_id"]
+
+
+def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
+    if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
+        return None
+    items = workspace.tables.records(ITEMS, {"dataset": dataset})
+    return next((item for item in items if item["item_id"] == item_id), None)
+
+
+def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
+    newest = max(rows, key=lambda row: row["created_at"])
+    if wanted is None:
+        return f"asked {len(rows)} times; the item is no longer in the benchmark, its answers stay in the ledger"
+    for row in rows:
+        if row["components"] == dict(wanted):
+            return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
+    old = newest["components"]
+    changed = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
+    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed]
+    return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return repr(text if len(text) <= 160 else text[:157] + "...")

@@ -1,0 +1,205 @@
+"""One stage in one Dagster run: which partitions are made, and which events tell Dagster of them.
+
+`run_step` is the whole protocol, in the one order that is sound. What the inputs are is noted before anything is read.
+What cannot be made yet, or would be made from something damaged, is left with the reason. Each partition is written,
+read again, checked and told to Dagster as soon as it is done. The step then ends without an error, so that everything
+below it that can do without what is missing is made; the last step of a run raises for all of them (`checks`).
+
+A partition of a range gets an `AssetMaterialization` with a data version of its own, since the versions of a
+`MaterializeResult` hold for all partitions of a step (Dagster's issues 21072 and 34013). An asset without partitions
+gets a `MaterializeResult`.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Generator, Iterator, Mapping
+from typing import Any, cast
+
+import dagster as dg
+from dagster._core.definitions.source_asset import SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.redaction import redacted
+from traps_pipeline.pipeline.checks import StageChecks, raise_for_run
+from traps_pipeline.pipeline.graph import Stage, the_graph
+from traps_pipeline.pipeline.history import History
+from traps_pipeline.pipeline.lineage import Lineage, write_report_state
+from traps_pipeline.pipeline.machine import parts_of_run, require_machine, why_nothing
+from traps_pipeline.pipeline.making import PartitionMaker
+from traps_pipeline.pipeline.metadata import partition_metadata, visible_metadata
+from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.storage.parquet import Made, State
+from traps_pipeline.storage.workspace import Workspace
+
+MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
+BACKFILL_TAG = "dagster/backfill"  # of a run of many: one that has nothing to make must not end them
+STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
+TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: what this run did for it; that another run has made it
+RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another one goes on with
+Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
+Events = Generator[Event, None, None]
+_ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
+
+
+def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
+    """Make what this run is to make of a stage; yield Dagster's events. Raises TrapsError where the step cannot begin,
+    and at the end of a run for all that it has not made."""
+    step = _Step(stage, context, workspace)
+    yield from step.tell_unwanted()
+    for key in step.to_make():
+        yield from step.checks.of_parents(step.lineage, key)
+        step.admit(key)
+    made_result: dg.MaterializeResult | None = None
+    for key, made in step.make():
+        version = step.write(key, made)
+        yield from step.checks.of_made(key, made)
+        progress.current().partition(stage.name, key or "", made.tally)
+        metadata = partition_metadata(workspace, stage, made) | {TALLY: json.dumps(vars(made.tally))}
+        if stage.scheme is None:
+            metadata = visible_metadata(metadata)
+            made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
+        else:
+            yield step.history.event(stage, key, version, step.provenance, metadata)
+    yield from step.tell_taken()
+    yield from step.tell_unmade()
+    yield from step.hand_on(made_result)
+    if not step.stages_below():
+        raise_for_run(context, step.graph, stage.name)
+
+
+class _Step:
+    """What `run_step` knows and does; its methods are called in the order in which they stand here."""
+
+    def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
+        self.stage, self.context, self.workspace, self.graph = stage, context, workspace, the_graph()
+        self.tags = context.run.tags
+        if context.run.run_id not in _ATTEMPTS:
+            _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
+        wanted = Wanted(workspace, self.tags.get(EXPERIMENT_TAG))
+        require_machine(workspace, parts_of_run(context, stage, wanted))
+        self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
+        self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
+        self.provenance = self.history.provenance(stage) if stage.scheme else {}
+        self.checks = StageChecks(workspace, self.graph, stage)
+        self._maker = PartitionMaker(workspace, stage, self.history)
+        self._inputs: dict[str | None, Mapping[str, str]] = {}  # of what is made, noted before anything is read
+        keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
+        asked = {*stage.wanted(wanted)}
+        self._wanted, self._unwanted = [k for k in keys if k in asked], [k for k in keys if k not in asked]
+
+    def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
+        """Count cells that no experiment asks for, which a range may hold, as done, so that a backfill ends."""
+        if MAKE_TAG in self.tags:
+            return
+        if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
+            why = why_nothing(self._unwanted, self.tags, self.workspace)
+            raise TrapsError(f"{self.stage.name}: nothing is made: {why}")
+        about = {"made": f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
+        for key in self._unwanted:
+            yield self.history.event(self.stage, key, "not wanted", self.provenance, about)
+
+    def to_make(self) -> list[str | None]:
+        """Return the keys of this run that are to be made: all that are wanted, or what its tag says of them."""
+        if MAKE_TAG not in self.tags:
+            return self._wanted
+        recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
+        name, lineage = self.stage.name, self.lineage
+        keys = [k for k in self._wanted if to_make(lineage, recorded, name, k, existing=existing)]
+        # What waits for something above it would be made twice.
+        return [k for k in keys if not (existing and lineage.waits(name, k))]
+
+    def admit(self, key: str | None) -> None:
+        """Note the inputs of a partition that can be made, or the reason why it cannot."""
+        if reason := self.lineage.blocked(self.stage.name, key, current=MAKE_TAG in self.tags):
+            self._maker.unmade[key] = TrapsError(reason)
+        else:
+            self._inputs[key] = self.lineage.inputs(self.stage.name, key)
+
+    def make(self) -> Iterator[tuple[str | None, Made]]:
+        """Make what was admitted."""
+        if self._inputs:
+            progress.current().stage(self.stage.name, len(self._inputs))
+        return self._maker.make(self._inputs)
+
+    def write(self, key: str | None, made: Made) -> str:
+        """Write what was made; return its data version."""
+        stage, inputs, content = self.stage, self._inputs[key], made.content
+        if stage.table is not None:
+            rows, failed = cast(Any, content), made.tally.errors
+            return self.workspace.tables.write(
+                stage.table, stage.columns(key), rows, inputs, failed=failed, code=stage.code
+            )
+        files = cast(Mapping[str, bytes], content)
+        self.workspace.store.write({self.workspace.reports / path: data for path, data in files.items()})
+        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
+        write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
+        return version
+
+    def tell_taken(self) -> Iterator[dg.AssetMaterialization]:
+        """Tell of partitions that other runs have made."""
+        for key, (version, tally) in self._maker.taken.items():
+            progress.current().partition(self.stage.name, key or "", tally)
+            about = {TAKEN: "made by another run meanwhile", TALLY: json.dumps(vars(tally))}
+            yield self.history.event(self.stage, key, version, self.provenance, about)
+
+    def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
+        """Tell of partitions that could not be made, and of those that fail a check, in this run or before."""
+        unmade = self._maker.unmade
+        if unmade:
+            end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
+        for key, error in unmade.items():
+            yield self.checks.of_unmade(key, error)
+        yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
+
+    def hand_on(self, made: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
+        """Hand on what an asset without partitions has made, or outputs for which Dagster writes no event of its own.
+
+        It skips what is below a step without outputs, and would write one event, with one version, for all partitions.
+        Observable sources, which tell their own versions too, carry this mark.
+        """
+        for name in self.context.op_def.output_dict:
+            if name != "result":
+                yield dg.Output(None, output_name=name)  # of a check
+        yield made or dg.MaterializeResult(metadata={SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION: True})
+
+    def stages_below(self) -> set[str]:
+        """The stages of this run that are made directly from this one."""
+        selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
+        return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
+
+
+def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
+    """Pass a step's events on; keep keys out of the traceback that Dagster stores, and call a run that a person stopped
+    by a signal canceled: Dagster, which did not stop it itself, would call it a failure."""
+    try:
+        yield from events
+    except Exception as error:
+        if (without_keys := redacted(error)) is error:
+            raise
+        raise without_keys from None
+    except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):
+        run = context.instance.get_run_by_id(context.run.run_id)
+        if run is not None and run.status == dg.DagsterRunStatus.STARTED:
+            context.instance.report_run_canceling(run, "Stopped by a signal.")
+        raise
+
+
+def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
+    """End this process where its run was resumed elsewhere since it had been resumed so many times: its host was
+    stopped and taken for dead. What it could not make another process makes, and it must not tell Dagster that the run
+    failed, which both of them are."""
+    if instance.count_resume_run_attempts(run_id) > attempts:
+        os._exit(RESUMED_ELSEWHERE)
+
+
+def to_make(
+    lineage: Lineage, recorded: Mapping[str | None, str | None], name: str, key: str | None, *, existing: bool = False
+) -> bool:
+    """Whether a partition is missing, stale, or unknown to Dagster: a crash between a table and its event leaves such a
+    table, which is made once more. existing: only what is there and made from what has changed since."""
+    status = lineage.status(name, key)
+    if existing or status.kind == "missing":
+        return bool(status.outdated) if existing else True
+    return status.kind == "stale" or recorded.get(key) != lineage.version(name, key)

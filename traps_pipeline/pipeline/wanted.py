@@ -1,0 +1,180 @@
+"""Which partitions a study wants: what its experiments ask about the scenarios that it has.
+
+Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all read this one answer, so nothing
+asks a model that no experiment of the study names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from itertools import product
+
+from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.models.registry import get_model, load_models, local_models
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
+from traps_pipeline.protocol.datasets import (
+    ALL_CATEGORIES,
+    ANSWERABLE,
+    BESIDE,
+    CATEGORIES,
+    DATASETS,
+    PROBED_ARMS,
+    PROBED_DATASETS,
+    TIME_SWAPPED,
+    all_datasets_of,
+)
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, REGIMES, VQA_PROMPTS
+from traps_pipeline.storage.benchmark_tables import SCENE_SPECS
+from traps_pipeline.storage.study import Asked, MechanismSettings
+from traps_pipeline.storage.workspace import Workspace
+
+
+class Wanted:
+    """The keys of every kind of partition that a study wants, in key order.
+
+    workspace: None for all that the registry has, which is what is shown where there is no study yet. experiment: the
+    name of one of the study's, whose part alone is wanted.
+    """
+
+    def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:
+        self._workspace = workspace
+        if workspace is None:
+            every = Asked(
+                datasets=(*DATASETS, *BESIDE), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
+            )
+            self._asked: Sequence[Asked] = [every]
+        else:
+            self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
+
+    @cached_property
+    def categories(self) -> list[str]:
+        """Categories with scenarios, and those whose scenarios were all discarded since their table was made."""
+        if self._workspace is None:
+            return [*CATEGORIES]
+        made = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
+        return [c for c in ALL_CATEGORIES if c in made or c in self._present]
+
+    @cached_property
+    def _present(self) -> list[str]:
+        return [*CATEGORIES] if self._workspace is None else categories_of(load_scenarios(self._workspace.study))
+
+    @cached_property
+    def datasets(self) -> list[str]:
+        """Datasets that have scenarios and are asked for."""
+        return self._datasets(self._asked)
+
+    @cached_property
+    def arms(self) -> list[str]:
+        """Arms and variations among them."""
+        return [dataset for dataset in self.datasets if dataset in BESIDE]
+
+    def _datasets(self, asked: Iterable[Asked]) -> list[str]:
+        there = {dataset for category in self._present for dataset in all_datasets_of(category)}
+        named = {dataset for experiment in asked for dataset in experiment.datasets}
+        return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in there & named]
+
+    @cached_property
+    def evaluations(self) -> list[Evaluation]:
+        """Every model under every regime in every run that is asked for, in the registry's order."""
+        named = {e for experiment in self._asked for e in _evaluations(experiment)}
+        place = {model: number for number, model in enumerate(load_models())}
+        return sorted(named, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
+
+    @cached_property
+    def cells(self) -> list[str]:
+        """Keys of the cells that are asked for."""
+        named = {
+            Cell(dataset, evaluation).key
+            for asked in self._asked
+            for dataset in self._datasets([asked])
+            for evaluation in _evaluations(asked)
+        }
+        every = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
+        return [key for key in every if key in named]
+
+    # --- inside local models ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
+        """Datasets (no arms) and settings of what is asked inside models; None where nothing is."""
+        if self._workspace is None:
+            return [*DATASETS], None
+        settings = self._workspace.study.mechanism
+        asked = [experiment for experiment in self._asked if experiment.mechanism]
+        datasets = [dataset for dataset in self._datasets(asked) if dataset in DATASETS]
+        return (datasets, settings) if asked and settings else None
+
+    @cached_property
+    def looks_inside(self) -> bool:
+        """Whether anything is asked inside models."""
+        return self._inside is not None
+
+    @cached_property
+    def steers(self) -> bool:
+        """Whether models are steered."""
+        return self._inside is not None and (self._inside[1] is None or self._inside[1].steering is not None)
+
+    @cached_property
+    def patches(self) -> bool:
+        """Whether activations are patched."""
+        return self._inside is not None and (self._inside[1] is None or self._inside[1].patching is not None)
+
+    @cached_property
+    def probed(self) -> list[str]:
+        """Datasets whose hidden states are extracted."""
+        datasets = self._inside[0] if self._inside else []
+        asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
+        there = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
+        there |= {made for made, of in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if of in there}
+        return [d for d in PROBED_DATASETS if d in there]
+
+    @cached_property
+    def extractions(self) -> list[Extraction]:
+        """Local models under the VQA prompts that are extracted."""
+        if self._inside is None:
+            return []
+        settings = self._inside[1]
+        models = local_models() if settings is None else [*settings.models]
+        return [Extraction(model, p) for model in models for p in (settings.prompts if settings else VQA_PROMPTS)]
+
+    @cached_property
+    def states(self) -> list[str]:
+        """Keys of hidden_states: what is no dataset of pairs serves probes alone."""
+        cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
+        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt == PROBE_PROMPT]
+
+    @cached_property
+    def probed_prompts(self) -> tuple[str, ...]:
+        """VQA prompts with whose states probes are fitted."""
+        settings = self._inside[1] if self._inside else None
+        return settings.probes.prompts if settings else (PROBE_PROMPT,)
+
+    @cached_property
+    def steered(self) -> list[str]:
+        """`model__directionregime__inferenceregime` of what is steered."""
+        if self._inside is None or not self.steers:
+            return []
+        settings = self._inside[1]
+        if settings is None:
+            runs = product(local_models(), VQA_PROMPTS, VQA_PROMPTS)
+        else:
+            assert settings.steering is not None, "`steers` says so"
+            runs = product(settings.models, settings.steering.direction_regimes, settings.steering.inference_regimes)
+        return ["__".join(run) for run in runs]
+
+    @cached_property
+    def steering(self) -> list[str]:
+        """Keys of the steering cells."""
+        datasets = self._inside[0] if self._inside else []
+        return [SteeringCell.parse(f"{dataset}|{run}").key for dataset, run in product(datasets, self.steered)]
+
+
+def _evaluations(asked: Asked) -> list[Evaluation]:
+    """Those that a model has enough runs for; of no runs named, all that it has."""
+    found = []
+    for model in asked.models:
+        available = range(1, get_model(model).runs + 1)
+        runs = [run for run in available if not asked.runs or run in asked.runs]
+        found += [Evaluation(model, regime, run) for regime in asked.regimes for run in runs]
+    return found

@@ -1,0 +1,1 @@
+"""Encoding of clips, and which of their frames a model is shown."""
