@@ -29,12 +29,14 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.patching_effects import (
     Patch,
+    Recorded,
     attributed_changes,
     patched_changes,
     record,
     require_patchable,
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
+from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
@@ -60,7 +62,7 @@ GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 RESAMPLES = 1000
 PROMPTS_KEPT = 8  # with their pixels; the parts of all prompts are kept
 Row = dict[str, Any]
-Cell = tuple[str, str, int, str]  # the side that is patched into, site, layer, group
+Cell = tuple[str, Site, int, str]  # the side that is patched into, site, layer, group
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,47 +145,45 @@ class Pairs:
 
     def _estimates(self, name: str) -> Iterator[Row]:
         for into, target, own, groups in self._directions(name):
-            about = {"scenario": name, "into": into, "source": OWN}
             if groups is None:
-                yield about | {"left_out": True}
+                yield {"scenario": name, "into": into, "source": OWN, "left_out": True}
                 continue
-            plain = record(self._model, target.prompt, self._tokens, ())
-            source = record(self._model, own.prompt, self._tokens, self._settings.sites)
-            for (site, layer), changes in attributed_changes(self._model, plain, source, self._tokens).items():
-                if site not in self._settings.sites:
-                    continue
+            ends, changes = self._attributed(target, own)
+            for (site, layer), by_token in changes.items():
                 for group, positions in groups.items():
-                    if positions.any():
-                        yield about | {
-                            **{"site": site, "layer": layer, "group": group, "tokens": int(positions.sum())},
-                            **{
-                                "before": plain.margin,
-                                "there": source.margin,
-                                "change": float(changes[positions].sum()),
-                            },
-                        }
+                    if positions.any() and site in self._settings.sites:
+                        change = float(by_token[positions].sum())
+                        yield _row(name, into, OWN, (site, layer, group), positions, ends, change)
 
     def _patches(self, name: str, best: Sequence[Cell]) -> Iterator[Row]:
         for into, target, _, groups in self._directions(name):
             if groups is None:
                 continue
+            cells: list[tuple[Site, int, str]]
             cells = [(site, layer, group) for side, site, layer, group in best if side == into and groups[group].any()]
-            patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]  # pyright: ignore[reportArgumentType]
+            patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
             plain, there = record(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
-                about = {"scenario": name, "into": into, "source": kind}
                 side = self._source(name, into, kind)
                 if side is None:
-                    yield about | {"left_out": True}
+                    yield {"scenario": name, "into": into, "source": kind, "left_out": True}
                     continue
-                source = record(self._model, side.prompt, self._tokens, self._settings.sites)
-                there = source.margin if kind == OWN else there
-                changes = patched_changes(self._model, plain, source, patches, self._tokens)
-                for (site, layer, group), patch, change in zip(cells, patches, changes, strict=True):
-                    yield about | {
-                        **{"site": site, "layer": layer, "group": group, "tokens": int(patch.positions.sum())},
-                        **{"before": plain.margin, "there": there, "change": float(change)},
-                    }
+                margin, changes = self._patched(plain, side, patches)
+                there = margin if kind == OWN else there
+                for cell, patch, change in zip(cells, patches, changes, strict=True):
+                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, there), float(change))
+            del plain  # before the other side's pass is recorded
+
+    def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
+        """The margins of both sides, and the estimated change by each token; the states are gone afterwards."""
+        plain = record(self._model, target.prompt, self._tokens, ())
+        source = record(self._model, own.prompt, self._tokens, self._settings.sites)
+        return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
+
+    def _patched(self, target: Recorded, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
+        """The margin of a source, and the changes by patches from it; its states are gone afterwards."""
+        source = record(self._model, side.prompt, self._tokens, self._settings.sites)
+        return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
         """Each side of a pair that has both, with the other side and the groups of positions."""
@@ -223,6 +223,21 @@ class Pairs:
         side = Side(prompt, spans(self._model, prompt, self._system, question))
         self._parts[name, which, times_of] = side.parts
         return side
+
+
+def _row(
+    scenario: str,
+    into: str,
+    source: str,
+    cell: tuple[Site, int, str],
+    positions: np.ndarray,
+    ends: tuple[float, float],
+    change: float,
+) -> Row:
+    """What a patch does to one pair. ends: the outcomes of the side that is patched and of the other one."""
+    site, layer, group = cell
+    about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
+    return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
 
 
 def _fits(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
