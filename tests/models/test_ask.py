@@ -239,8 +239,7 @@ def test_closing_the_work_early_records_the_calls_in_flight(tmp_path: Path) -> N
     running = run_work(job, [CELL, other])
     assert next(running)["cell"] == CELL
     running.close()  # type: ignore[attr-defined]
-    assert len(backends["n"].calls) == 4
-    assert len(local(tmp_path).read(other.evaluation.key).rows) == 4
+    assert len(local(tmp_path).read(other.evaluation.key).rows) == len(backends["n"].calls) >= 4
 
 
 def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_path: Path) -> None:

@@ -87,7 +87,9 @@ def curves() -> pd.DataFrame:
 def patching() -> pd.DataFrame:
     row = {"dataset": "chaotic", "into": "control", "site": "residual", "layer": 0, "group": "stamps"}
     row |= {"low": 0.9, "high": 1.1, "n": 6, "n_left_out": 1, "tokens": 6.0}
-    return frame(PATCHING, row | {"source": "pair", "effect": 0.99}, row | {"source": "same side", "effect": 0.01})
+    estimated = row | {"source": "pair", "group": "last", "attributed": 0.4, "effect": None}
+    own = row | {"source": "pair", "attributed": 0.8, "effect": 0.99}
+    return frame(PATCHING, own, estimated, row | {"source": "same side", "effect": 0.01})
 
 
 def item_scores() -> pd.DataFrame:
@@ -210,12 +212,8 @@ def test_few_answers_are_marked_and_p_is_printed() -> None:
     assert any(note.startswith("†") for note in nulls.notes)
     (patched,) = patching_table(Made())
     (row,) = cells(patched)
-    assert (row["Indirect effect"], row["Same side"], row["Other times"], row["Left out"]) == (
-        "0.990 †",
-        "0.010",
-        "–",
-        "1",
-    )
+    printed = [row[name] for name in ("Estimate", "Indirect effect", "Same side", "Other times", "Left out")]
+    assert printed == ["0.800", "0.990 †", "0.010", "–", "1"]
 
 
 def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:

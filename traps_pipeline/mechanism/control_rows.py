@@ -215,8 +215,13 @@ class PatchingRow(Extracted):
         "system, stamps, changed (visual tokens whose pixels differ between the sides), unchanged, question, last, "
         "or all",
     ]
+    attributed: Annotated[
+        float | None, "estimate of `effect` to first order, from one backward pass a pair; null for nulls"
+    ]
     effect: Annotated[
-        float | None, "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it"
+        float | None,
+        "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it; null where no "
+        "patch was made",
     ]
     low: Annotated[float | None, "95 % interval, pairs resampled with one unseen"]
     high: Annotated[float | None, "95 % interval, pairs resampled with one unseen"]
