@@ -149,10 +149,7 @@ class ProbeRow(Extracted):
     n_controls: Annotated[int, "control items of the target"]
     own_best: Annotated[bool, "whether this layer has the highest value of its own curve (uses target labels)"]
     all_sample_best: Annotated[bool, "whether this pair's transfer curve is highest at this layer (uses target labels)"]
-    source_best: Annotated[
-        bool,
-        "whether the source's own cross-validation is highest at this layer (uses no target label)",
-    ]
+    chosen: Annotated[bool, "whether the target is read at this layer, chosen on pairs of other datasets alone"]
     note: Annotated[str | None, "why there is no figure"]
     made_of: Annotated[
         str,
@@ -206,6 +203,13 @@ class CosineRow:
     other_prompt: Prompt
     other_dataset: shared.Dataset
     cosine: Annotated[float, "-1 to 1"]
+    disattenuated: Annotated[
+        float | None,
+        "the same of products of different scenarios, so without their noise; null if nothing else is left",
+    ]
+    low: Annotated[float | None, "95 % interval of the disattenuated cosine, scenarios resampled"]
+    high: Annotated[float | None, "95 % interval of the disattenuated cosine, scenarios resampled"]
+    split_half: Annotated[float | None, "cosine between directions of random halves of the first one's pairs, mean"]
 
 
 COSINES = Table(
