@@ -197,4 +197,4 @@ def test_a_panel_that_is_seen_on_its_way_comes_when_it_is_first_seen() -> None:
     frames = clip()
     for at, top in ((20, -60), (21, 20), (22, 100), (23, 100), (24, 100)):  # 160 pixels high, in steps of 80
         frames[at, max(0, top) : top + 160, 100:300] = NAVY
-    assert len(before_panel(frames)) == 19  # its shadow may come one frame before it does
+    assert len(before_panel(frames)) == 20

@@ -60,7 +60,8 @@ def scene_family(
         shown = before_panel(frames)  # what a panel covers at the end was seen before it came
         unflagged = shown if twins is None else without_flags(shown)
         if foresee is not None and len(shown) < len(frames):
-            return _first(unflagged, named, (observe, foresee) if still(shown) else (foresee, observe))
+            at_rest = still(shown) or still(shown[:-1])  # the shadow of a panel may come before it does
+            return _first(unflagged, named, (observe, foresee) if at_rest else (foresee, observe))
         said = observe(unflagged, named)
         if said is None and look is not None and len(end := after_panel(unflagged)) < len(unflagged):
             return look(end, named)

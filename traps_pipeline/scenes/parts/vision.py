@@ -15,7 +15,7 @@ import numpy as np
 from traps_pipeline.scenes.parts.look import PANELS
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
-PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
+PANEL_PX = 7000  # a panel that comes before a scene is larger, whatever moves is smaller
 STEP_PX = 4000  # of it that come in one step
 COMING_PX = 600  # of a panel on its way, that are new in a frame
 COMES_FRAMES = 4  # of five a second, in which it may be seen on its way
@@ -149,26 +149,24 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
 
 
 def _stands_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
-    """Whether a large region that had another colour before frame `comes` has this one soon and at the end."""
-    soon, end = frames[min(comes + COMES_FRAMES, len(frames) - 1)], frames[-1]
-    before, there, stays = (_apart(frame, colour) <= ALIKE for frame in (frames[comes - 1], soon, end))
-    stands = stays & ~before
-    return bool(stands.sum() >= PANEL_PX and (there & stands).sum() > 0.9 * stands.sum())
+    """Whether a large region has this colour soon after frame `comes`, and at the end, that had another one before: in
+    the last frame, and some frames ago, when nothing that goes again had covered it."""
+    ago, soon = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
+    before, was, there, stays = (_apart(frames[at], colour) <= ALIKE for at in (comes - 1, ago, soon, -1))
+    stands = stays & ~before & ~was
+    whole = cv2.morphologyEx(stands.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))  # lines between slats
+    return bool(whole.sum() >= PANEL_PX and (there & stands).sum() > 0.9 * stands.sum())
 
 
 def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
-    """The first frame in which a panel of a colour is seen on its way, or its shadow, a large part of which comes in
-    frame `comes`; that one if the panel stands in it already."""
-    now, end = (_apart(frame, colour) <= ALIKE for frame in (frames[comes], frames[-1]))
-    if (now & end).sum() > 0.9 * end.sum():
-        return comes
+    """The first frame in which a panel of a colour is seen on its way, a large part of which comes in frame `comes`."""
     first = comes
     while first > max(1, comes - COMES_FRAMES):
         now, before = (_apart(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
         if (now & ~before).sum() < COMING_PX:
             break
         first -= 1
-    return max(1, first - 1)
+    return first
 
 
 def after_panel(frames: np.ndarray) -> np.ndarray:
