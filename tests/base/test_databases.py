@@ -12,8 +12,8 @@ from sqlalchemy.exc import OperationalError
 
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.explorer.labelstore import LabelStore
 from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.servers.labelstore import LabelStore
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

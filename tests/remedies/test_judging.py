@@ -13,7 +13,6 @@ from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
 from tests.judging.conftest import answered_study, judge_at
 from tests.providers.server import Provider
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
 from traps_pipeline.judging.judging_rows import CONFABULATION, VOTES
 from traps_pipeline.judging.panel import collect_votes, judged_answers, wanted_ballots
 from traps_pipeline.judging.robustness import check_panel, load_attacks
@@ -23,6 +22,7 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.people.judge_validation import annotation_sheet, read_labels, write_sheet
 from traps_pipeline.people.labels import LABELS_FILE, label_lines
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.servers.labelstore import DATABASE, LabelStore
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -176,7 +176,7 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     path.write_bytes(path.read_bytes() + b"nonsense\n")
     remedied(
         lambda: LabelStore(tmp_path),
-        "explorer.labelstore._last_seq",
+        "servers.labelstore._last_seq",
         lambda: shutil.copy(kept, path),
     )
     for name in (f"{DATABASE}-wal", f"{DATABASE}-shm"):
@@ -184,7 +184,7 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     (tmp_path / DATABASE).write_bytes(b"nonsense" * 1000)
     again = remedied(
         lambda: LabelStore(tmp_path),
-        "explorer.labelstore.LabelStore._database",
+        "servers.labelstore.LabelStore._database",
         lambda: (tmp_path / DATABASE).rename(tmp_path / "away"),
     )
     assert again.labelled("jd", "abstention") == ["u1", "u2"]

@@ -8,6 +8,7 @@ import certifi
 import pytest
 
 from tests.remedies.remedied import remedied
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import check_name
 from traps_pipeline.base.network import check_network
@@ -46,11 +47,19 @@ def test_a_variable_of_the_network_is_mended_or_unset(
 
 
 @pytest.mark.slow
-def test_variables_that_choose_an_opengl_that_does_not_draw_are_unset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [("MUJOCO_GL", "nonsense"), ("GALLIUM_DRIVER", "nonsense"), ("MESA_GL_VERSION_OVERRIDE", "1.0")],
+)
+def test_variables_that_choose_an_opengl_that_does_not_draw_are_named_and_unset(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(TrapsError, match=f"cannot render clips with .*{variable}={value}"):
+        check_rendering()
 
     def unset() -> None:
-        monkeypatch.delenv("MUJOCO_GL")
+        monkeypatch.delenv(variable)
         monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
 
     remedied(check_rendering, "scenes.picture.trial.check_rendering", unset)

@@ -28,8 +28,8 @@ def add(commands: Commands) -> None:
 def annotate(arguments: argparse.Namespace) -> int:
     """See `traps annotate --help`."""
     require("web")
-    from traps_pipeline.explorer.annotate import Annotation, annotation_app
-    from traps_pipeline.explorer.server import serve
+    from traps_pipeline.servers.annotate import Annotation, annotation_app
+    from traps_pipeline.servers.server import serve
 
     people = [name.strip() for name in arguments.who]
     wrong = [name for name in people if not re.fullmatch(r"[\w.@-]{1,60}", name)]

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from traps_pipeline.explorer.server import Listening
     from traps_pipeline.pipeline.experiment import Experiment
+    from traps_pipeline.servers.server import Listening
     from traps_pipeline.storage.place import Place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -88,7 +88,7 @@ def listening_of(
     danger: what everybody who reaches the address could do. Raises TrapsError."""
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
-    from traps_pipeline.explorer.server import Listening
+    from traps_pipeline.servers.server import Listening
 
     if arguments.behind:
         public_name(arguments.behind)

@@ -23,8 +23,8 @@ def review(arguments: argparse.Namespace) -> int:
     """See `traps review --help`."""
     require("web")
     from traps_pipeline.base.paths import require_own_corrections
-    from traps_pipeline.explorer.review import Review, review_app
-    from traps_pipeline.explorer.server import serve
+    from traps_pipeline.servers.review import Review, review_app
+    from traps_pipeline.servers.server import serve
 
     if not arguments.who.strip():
         raise TrapsError("--who: say whose decisions these are, e.g. --who jd")

@@ -10,9 +10,10 @@ import pytest
 
 from tests.foreign_page import CHROMIUM, QUIET
 from traps_pipeline.base.terminal import visible
-from traps_pipeline.explorer.server import WEB, templates
+from traps_pipeline.explorer.site import WEB
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.report.writing import environment
+from traps_pipeline.servers.server import templates
 
 # Overrides, isolates and marks of direction; ESC, BEL, a C1 control, a lone carriage return; what belongs to a text.
 HOSTILE = "a\u202eb \u2066c\u2069 \u2067\u2068 \u200e\u200f\u061c \x1b[31md\x07\x9b\x85 e\rf\tg\r\nh\n"

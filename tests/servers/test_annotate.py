@@ -13,10 +13,10 @@ from tests.build.labels import MODEL, labelled_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import personal_tokens, public_name
 from traps_pipeline.cli import main
-from traps_pipeline.explorer.annotate import Annotation, Sent
-from traps_pipeline.explorer.server import Listening
 from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
+from traps_pipeline.servers.annotate import Annotation, Sent
+from traps_pipeline.servers.server import Listening
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -52,7 +52,7 @@ def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
 
 
 def test_a_study_without_clips_or_answers_says_so(tmp_path: Path) -> None:
-    with raises(TrapsError, "explorer.annotate.Annotation.__init__"):
+    with raises(TrapsError, "servers.annotate.Annotation.__init__"):
         Annotation(Workspace.create(tmp_path / "study", Study(name="empty", panel="rules")))
 
 

@@ -23,6 +23,7 @@ from fastapi.responses import JSONResponse, Response
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import finalized
 from traps_pipeline.base.webguard import Guard
+from traps_pipeline.explorer.site import WEB as SHARED
 from traps_pipeline.storage.workspace import Workspace
 
 WEB = Path(__file__).parent / "web"
@@ -72,15 +73,16 @@ def templates() -> jinja2.Environment:
 
 def page(template: str, **values: Any) -> str:
     """A page with the explorer's look. Its policy lets it load its own scripts, clips and pictures alone."""
-    style = (WEB / "style.css").read_text(encoding="utf-8")
+    style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return templates().get_template(template).render(style=style, style_digest=digest, **values)
 
 
 @cache
 def script(*names: str) -> str:
-    """Some of the explorer's sources as one classic script, in a scope of their own."""
-    sources = "\n".join((WEB / name).read_text(encoding="utf-8") for name in names)
+    """Return sources of this room and of the explorer as one classic script, in a scope of their own."""
+    paths = [WEB / name if (WEB / name).is_file() else SHARED / name for name in names]
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.explorer.labelstore import DATABASE, LabelStore, NotWaiting
 from traps_pipeline.people.human_label_rows import LABELS_FILE
 from traps_pipeline.people.labels import label_lines
+from traps_pipeline.servers.labelstore import DATABASE, LabelStore, NotWaiting
 
 YES = {"abstained": True}
 
@@ -26,7 +26,7 @@ def test_only_what_waits_is_labelled_and_two_stores_append_to_one_file(tmp_path:
     for store, who in ((one, "jd"), (other, "ab"), (one, "cy")):
         store.show(who, "abstention", "u1", "plinko-0001")
         store.record(who, "abstention", "u1", YES)
-    with raises(NotWaiting, "explorer.labelstore.LabelStore.record"):
+    with raises(NotWaiting, "servers.labelstore.LabelStore.record"):
         other.record("jd", "abstention", "u1", YES)
     one.show("jd", "abstention", "u1", "plinko-0001")  # shown again, it may be labelled again
     other.record("jd", "abstention", "u1", {"abstained": False})
@@ -62,8 +62,8 @@ def test_what_a_crash_leaves_is_made_whole_again(tmp_path: Path) -> None:
     again.record("jd", "abstention", "u4", YES)
     assert kept(tmp_path)[-1] == (4, "jd", "u4")
     (tmp_path / LABELS_FILE).write_bytes(whole + b"nonsense\n")
-    with raises(TrapsError, "explorer.labelstore._last_seq"):
+    with raises(TrapsError, "servers.labelstore._last_seq"):
         LabelStore(tmp_path)
     (tmp_path / DATABASE).write_bytes(b"nonsense" * 1000)
-    with raises(TrapsError, "explorer.labelstore.LabelStore._database"):
+    with raises(TrapsError, "servers.labelstore.LabelStore._database"):
         LabelStore(tmp_path)

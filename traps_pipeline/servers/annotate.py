@@ -20,14 +20,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import WHO
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.explorer.labelstore import LabelStore, NotWaiting
-from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
 from traps_pipeline.people.labels import LABELS
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.servers.labelstore import LabelStore, NotWaiting
+from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 

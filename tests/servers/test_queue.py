@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.explorer.duplicates import Comparison, fingerprint, neighbours
-from traps_pipeline.explorer.queue import queue
+from traps_pipeline.servers.duplicates import Comparison, fingerprint, neighbours
+from traps_pipeline.servers.queue import queue
 from traps_pipeline.video.encode import encode
 
 FLAGS = pd.DataFrame({"judges": [3, 0, 7], "models": [0.0, 0.25, 0.1]}, index=pd.Index(["a-1", "a-2", "a-3"]))

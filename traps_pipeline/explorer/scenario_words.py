@@ -1,0 +1,48 @@
+"""Words about a scenario, from its SCENE_SPECS row: its answer, what makes the void, what its certificates say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+
+def closes_frame(spec: Mapping[str, Any]) -> int | None:
+    """Return the frame from which an occluder closes the control; None if none does."""
+    control = json.loads(spec["control"])
+    return None if control is None else control["closes_frame"]
+
+
+def answer_of_control(spec: Mapping[str, Any]) -> str:
+    """Return the control's answer, and until when its outcome is in view."""
+    frame, fps = closes_frame(spec), json.loads(spec["physics"])["fps"]
+    return spec["ground_truth"] if frame is None else f"{spec['ground_truth']}, in view until {frame / fps:.1f} s"
+
+
+def intervention(spec: Mapping[str, Any]) -> str:
+    """Return how the control's clip was changed to make the void."""
+    at = f"{spec['void_from_s']:.1f} s"
+    return f"hidden from {at}" if spec["void_kind"] == "occluder" else f"cut at {at}"
+
+
+_PHRASES = {
+    "commit_s": "outcome settled at {} s",
+    "read_s": "in view for {:.1f} s before a panel comes",
+    "margin_m": "margin {} m",
+    "least_visible_px": "at least {:.0f} pixels when last in view",
+    "ablation_px": "{} pixels change without what is hidden",
+    "cause_moving_s": "cause seen moving for {} s",
+    "panel_covers": "the panel covers {:.0%} of where things move",
+    "twin_px": "{} pixels between void and twin's void",
+    "entropy_bits": "futures disagree by {:.2f} bits",
+    "top_share": "the best guess is right in {:.0%} of them",
+    "accepted": "{} futures look alike",
+    "twin_largest_difference": "twin differs by at most {} of 255 before the cut",
+}
+
+
+def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield name and words of each number of a scenario's evidence, on which its certificates rest."""
+    for name, phrase in _PHRASES.items():
+        if evidence.get(name) is not None:
+            yield name, phrase.format(evidence[name])
