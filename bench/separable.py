@@ -1,28 +1,20 @@
-"""What is earned by abstaining for reasons of the clip alone or of the question alone (docs/scoring.md, "Conjunction").
+"""What is earned by abstaining for reasons of the clip alone or of the question alone (docs/scoring.md, "Beyond PECS").
 
-Two learned classifiers never meet: one reads cheap numbers of a clip (length, boards, motion at 5 frames a second of
-160 x 120 pixels), the other the words of a question. Where they do not abstain they answer like an oracle, so that each
-figure bounds what such a rule can earn. `or` and `and` combine their decisions, `sum` adds their evidence; `joint` is
-no such rule: one classifier that reads both. Each is fitted on other scenarios, or on other families, than it is asked
-about, and knows all datasets and arms. The figures are the project's own (`scoring`).
-
-Drawing all records takes about 40 minutes of CPU, kept by --features; fitting takes two.
+Two learned classifiers never meet: boosted trees read numbers of a clip (its length, where a board stands and from
+when, how much moves and when it rests), a regression reads the words of a question. The numbers come from the records, so
+that no picture is drawn: a reader of pixels knows them less well. Where a rule does not abstain it answers like an
+oracle, so that each figure bounds what it can earn. `or` and `and` join the two decisions, `sum` adds their evidence;
+`joint` is no such rule: one classifier that reads both. Each is fitted on other scenarios, or on other families, than
+it is asked about. The figures are the project's own (`scoring`).
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from itertools import pairwise
-from multiprocessing import get_context
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "osmesa")
-
-import cv2
 import numpy as np
 import pandas as pd
 from sklearn.ensemble import HistGradientBoostingClassifier
@@ -33,33 +25,32 @@ from sklearn.model_selection import GroupKFold
 from bench.quick import parse
 from bench.shortcuts import first_of_each
 from traps_pipeline.base.paths import RELEASED
-from traps_pipeline.benchmark.filmed_arms import KNOWN
+from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.protocol.datasets import DATASETS, arms_of
-from traps_pipeline.scenes.parts.vision import largest_board
-from traps_pipeline.scenes.picture import render
-from traps_pipeline.scenes.variants.arms import Question, Scenario
+from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN
+from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.variants.arms import SHOWN_AGAIN_S
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.worlds.world import closing_of
+from traps_pipeline.scoring.metrics import pecs_of
 from traps_pipeline.scoring.robust import robust
 
-SIZE = (160, 120)
-BOARD_PX = 100  # of a board in one piece: those of voids have 850 and more at this size
-STILL = 0.05  # mean change of a pixel, of 255 levels, below which nothing moves
+BEHIND_M = 1.0  # a decoy's distance behind the board's place, about what arms choose
 FOLDS = {"scenario_id": 5, "family": 12}
+WORDS = 300  # the commonest words and pairs of words
 RULES = ("clip", "text", "or", "and", "sum", "joint")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--per-family", type=int, help="the first so many records of each family; default: all")
-    parser.add_argument("--features", type=Path, help="Parquet file of drawn items: read if it exists, else written")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    arguments = parse(parser, per_family=2, workers=1)
-    items = items_of(arguments.per_family, arguments.workers, arguments.features)
-    print(f"{len(items)} items of {items['scenario_id'].nunique()} scenarios, {items['family'].nunique()} families")
+    arguments = parse(parser, per_family=3)
+    chosen = first_of_each(load_released(), arguments.per_family)
+    items = pd.DataFrame([row for spec in chosen for row in rows_of(spec)])
+    print(f"{len(items)} items of {len(chosen)} scenarios, {items['family'].nunique()} families")
     for held_out, folds in FOLDS.items():
-        print(f"\n{held_out} held out: PECS, PECS-R, J of its datasets")
+        print(f"\n{held_out} held out: PECS, robust, conjunction; J of the four datasets and of crossed")
         for rule, abstains in decisions(items, held_out, folds).items():
             print_figures(rule, items.assign(abstained=abstains))
 
@@ -67,76 +58,79 @@ def main() -> None:
 # --- items ------------------------------------------------------------------------------------------------------------
 
 
-def items_of(per_family: int | None, workers: int, kept: Path | None) -> pd.DataFrame:
-    """Return an item a row: its dataset, side and question, and what is measured of its clip (columns f0, f1, ..)."""
-    if kept is not None and kept.exists():
-        return pd.read_parquet(kept)
-    chosen = first_of_each(load_released(), per_family)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        items = pd.DataFrame([row for rows in pool.map(rows_of, chosen) for row in rows])
-    if kept is not None:
-        items.to_parquet(kept)
-    return items
+@dataclass(frozen=True)
+class Clip:
+    """What a clip shows. qpos: (F, nq). board: where one stands in frames start to stop."""
+
+    camera: Camera
+    qpos: np.ndarray
+    board: Panel | None = None
+    start: int = 0
+    stop: int = 0
+
+    def numbers(self) -> dict[str, float]:
+        """Return what can be said of the clip in cheap numbers."""
+        n = len(self.qpos)
+        steps = np.linalg.norm(np.diff(self.qpos, axis=0, prepend=self.qpos[:1]), axis=1)
+        covered = np.zeros(n, bool)
+        place = np.full(4, -1.0)
+        if self.board is not None:
+            covered[self.start : self.stop] = True
+            corners = self.camera.project(self.board.corners())
+            place = np.concatenate([corners.mean(axis=0), np.ptp(corners, axis=0)])
+        still = steps < 1e-3
+        rest = n - 1 - int(np.flatnonzero(~still).max(initial=0))
+        in_view = np.append(steps[~covered], 0.0)
+        values = [
+            *(n, covered[0], covered[n // 2], covered[-1], covered.mean(), covered.argmax(), *place),
+            *(still.mean(), rest, rest / n, still[-1], in_view.sum(), (in_view < 1e-3).mean()),
+            *(steps[covered.argmax() - 1] if covered.any() else -1.0, steps.argmax(), steps.argmax() / n),
+            *steps[-5:],
+            *np.quantile(steps, (0.1, 0.25, 0.5, 0.75, 0.9, 1.0)),
+        ]
+        return {f"f{i}": float(value) for i, value in enumerate(values)}
 
 
-def rows_of(spec: SceneSpec) -> list[dict[str, Any]]:
-    render.SUPERSAMPLE = 1  # a clip is made smaller anyway
-    trajectory = RELEASED / "trajectories" / f"{spec.scenario_id}.npz"
-    qpos = load_trajectory(trajectory, spec.trajectory_sha256)
-    scenario = Scenario.of_record(spec, qpos, load_trajectory(trajectory, spec.twin.trajectory_sha256, "twin"))
+def rows_of(spec: SceneSpec) -> Iterator[dict[str, Any]]:
+    """Yield the items of a scenario: dataset, side, question and the numbers of the clip (columns f0, f1, ..)."""
     about = {"scenario_id": spec.scenario_id, "family": spec.family, "category": spec.category}
-    return [
-        {**about, "dataset": dataset, "side": asked.side, "question": asked.text, **numbers}
-        for dataset, asked, numbers in asked_of(scenario)
-    ]
+    for dataset, side, question, clip in asked_of(spec):
+        yield {**about, "dataset": dataset, "side": side, "question": question, **clip.numbers()}
 
 
-def asked_of(scenario: Scenario) -> Iterator[tuple[str, Question, dict[str, float]]]:
-    spec, open_frames = scenario.spec, scenario.control.open_frames
-    closed = scenario.control.behind_panel(range(open_frames, len(scenario.control.qpos)))
-    clips = {
-        "control": measured([*scenario.control_frames[:open_frames], *closed][scenario.sampled]),
-        "void": measured(scenario.void_frames[scenario.sampled]),
-        "twin": measured(scenario.twin_frames[scenario.sampled]),
-    }
+def asked_of(spec: SceneSpec) -> Iterator[tuple[str, str, str, Clip]]:
+    """Yield the pairs and the robust arms, as far as records tell which scenarios admit these."""
+    trajectory = RELEASED / "trajectories" / f"{spec.scenario_id}.npz"
+    camera, closing = Camera.from_record(spec.camera), closing_of(spec)
+    shown = Clip(camera, load_trajectory(trajectory, spec.trajectory_sha256))
+    n, end = len(shown.qpos), len(shown.qpos) if closing is None else closing.frame
+    control = shown if closing is None else replace(shown, board=closing.panel, start=end, stop=n)
+    occluder = spec.void_kind == "occluder"
+    board = Panel.from_record(spec.void["panel"]) if occluder else None
+    cut = n if occluder else int(spec.void["cut_frame"])
+    void = Clip(camera, shown.qpos[:cut], board, 0, n)
+    twin = Clip(camera, load_trajectory(trajectory, spec.twin.trajectory_sha256, "twin"))
     ill_posed = f"{spec.taxonomy}_ill_posed"
-    for dataset in (spec.taxonomy, ill_posed):
-        yield dataset, Question("control", spec.question, None), clips["control"]
-    yield spec.taxonomy, Question("void", spec.question, None), clips["void"]
-    yield ill_posed, Question("void", spec.ill_posed_question, None), clips["control"]
-    yield "aside", Question("control", spec.answerable_question.question, None), clips["void"]
-    for arm in arms_of(spec.taxonomy):
-        try:
-            questions, frames = KNOWN[arm].ask(spec), KNOWN[arm].film(scenario).frames
-        except Rejected:
-            continue
-        for asked in questions:
-            yield arm, asked, clips[asked.clip] if asked.clip else measured(frames[scenario.sampled])
-
-
-def measured(frames: Sequence[np.ndarray]) -> dict[str, float]:
-    """Return the cheap numbers of a clip; nothing in them depends on the question."""
-    small = [cv2.resize(frame, SIZE, interpolation=cv2.INTER_AREA) for frame in frames]
-    boards = np.array([board_in(frame) for frame in small])
-    steps = np.array([np.abs(a.astype(np.int16) - b).mean() for a, b in pairwise(small)] or [0.0])
-    still = steps < STILL
-    until_end = len(steps) - (np.flatnonzero(~still)[-1] + 1 if not still.all() else 0)
-    last = np.resize(steps[::-1], 5)
-    values = [
-        *(len(small), *boards[0], *boards[len(boards) // 2], *boards[-1]),
-        *((boards[:, 0] > 0).mean(), boards[:, 0].min(), boards[:, 0].max(), boards[:, 2].max(), boards[:, 2].min()),
-        *(np.diff(boards[:, 0], prepend=boards[0, 0]).max(), np.diff(boards[:, 0], prepend=boards[0, 0]).argmax()),
-        *(steps.sum(), steps.mean(), steps.max(), steps.argmax(), steps.argmax() / len(steps), still.mean()),
-        *(until_end, until_end / len(steps), *last, *np.quantile(steps, (0.1, 0.25, 0.5, 0.75, 0.9))),
-        *(np.mean(small[0]), np.mean(small[-1]), np.abs(small[-1].astype(np.int16) - small[0]).mean()),
-    ]
-    return {f"f{i}": float(value) for i, value in enumerate(values)}
-
-
-def board_in(frame: np.ndarray) -> tuple[float, float, float]:
-    """Return area and centre (x, y) of the largest region that looks like a board; 0, -1, -1 where there is none."""
-    board = largest_board(frame, BOARD_PX)
-    return (0.0, -1.0, -1.0) if board is None else (float(board.area), float(board.x), float(board.y))
+    yield spec.taxonomy, "control", spec.question, control
+    yield spec.taxonomy, "void", spec.question, void
+    yield ill_posed, "control", spec.question, control
+    yield ill_posed, "void", spec.ill_posed_question, control
+    yield TWIN, "control", spec.question, twin
+    if board is None:
+        yield "length_matched", "control", spec.question, replace(shown, qpos=shown.qpos[end - cut : end])
+    else:
+        forward = camera.axes()[2]
+        x, y, z = (float(value) for value in np.array(board.centre) + BEHIND_M * forward)
+        yield "decoy", "control", spec.question, replace(shown, board=replace(board, centre=(x, y, z)), stop=n)
+        fps = spec.physics["fps"]
+        until = n - round(SHOWN_AGAIN_S * fps)
+        if spec.void["hidden_from_frame"] < until and spec.evidence["commit_s"] * fps <= n - 2:
+            yield "removed", "control", spec.question, replace(shown, board=board, stop=until)
+    try:
+        for asked in arm_of(spec, CROSSED).ask(spec):
+            yield CROSSED, asked.side, asked.text, {"control": control, "void": void}[str(asked.clip)]
+    except Rejected:
+        return
 
 
 # --- rules ------------------------------------------------------------------------------------------------------------
@@ -144,44 +138,43 @@ def board_in(frame: np.ndarray) -> tuple[float, float, float]:
 
 def decisions(items: pd.DataFrame, held_out: str, folds: int) -> dict[str, np.ndarray]:
     """Return whether each rule abstains on each item, fitted on items of other groups (`held_out`)."""
-    void = (items["side"] == "void").to_numpy()
-    asked_in_vain = void & ~items["dataset"].isin(VISUAL_VOIDS).to_numpy()  # its question is the reason to abstain
-    clip = items.filter(regex=r"^f\d+$").to_numpy(float)
-    words = CountVectorizer(ngram_range=(1, 2), binary=True, max_features=400).fit_transform(items["question"])
-    text = np.asarray(words.todense(), float)
-    both = np.hstack([clip, text])
+    void, crossed = (items["side"] == "void").to_numpy(), (items["dataset"] == CROSSED).to_numpy()
+    ill_posed = void & items["dataset"].str.endswith("_ill_posed").to_numpy()
+    clip, groups = items.filter(regex=r"^f\d+$").to_numpy(float), items[held_out].to_numpy()
+    words = CountVectorizer(ngram_range=(1, 2), binary=True, max_features=WORDS)
+    text = words.fit_transform(items["question"]).toarray().astype(float)
     abstains = {rule: np.zeros(len(items), bool) for rule in RULES}
-    groups = items[held_out].to_numpy()
     for train, test in GroupKFold(min(folds, len(set(groups)))).split(clip, groups=groups):
-        of_clip = train[~asked_in_vain[train]]
-        by_clip = fitted(clip[of_clip], void[of_clip]).predict(clip[test])
-        of_text = train[~(void & ~asked_in_vain)[train]]
-        by_text = fitted(text[of_text], asked_in_vain[of_text]).predict(text[test])
+        # Crossed items contradict either classifier alone; each learns its own reason to abstain.
+        of_clip, of_text = train[~(ill_posed | crossed)[train]], train[~((void & ~ill_posed) | crossed)[train]]
+        by_clip = trees(clip[of_clip], void[of_clip]).predict(clip[test])
+        by_text = words_alone(text[of_text], void[of_text]).predict(text[test])
         abstains["clip"][test], abstains["text"][test] = by_clip, by_text
         abstains["or"][test], abstains["and"][test] = by_clip | by_text, by_clip & by_text
         abstains["sum"][test] = summed(clip, text, void, groups, train, test)
-        abstains["joint"][test] = fitted(both[train], void[train]).predict(both[test])
+        both = np.hstack([clip, text])
+        abstains["joint"][test] = trees(both[train], void[train]).predict(both[test])
     return abstains
 
 
-VISUAL_VOIDS = ("occlusion", "chaotic", "frame_out", "held_void")
+def trees(features: np.ndarray, void: np.ndarray) -> HistGradientBoostingClassifier:
+    return HistGradientBoostingClassifier(max_iter=60, learning_rate=0.2, random_state=0).fit(features, void)
 
 
-def fitted(features: np.ndarray, void: np.ndarray) -> HistGradientBoostingClassifier:
-    return HistGradientBoostingClassifier(max_iter=150, learning_rate=0.1, random_state=0).fit(features, void)
+def words_alone(features: np.ndarray, void: np.ndarray) -> LogisticRegression:
+    return LogisticRegression(C=10, max_iter=300).fit(features, void)
 
 
 def summed(
     clip: np.ndarray, text: np.ndarray, void: np.ndarray, groups: np.ndarray, train: np.ndarray, test: np.ndarray
 ) -> np.ndarray:
-    """Return decisions by a weighted sum of the evidence of the clip and of the question, each fitted alone."""
-    inner = GroupKFold(3)
+    """Return decisions by a weighted sum of the evidence of the clip and of the question, each fitted alone to all."""
+    readers = ((trees, clip), (words_alone, text))
     evidence = np.zeros((len(train), 2))
-    for fit, held in inner.split(train, groups=groups[train]):
-        for k, features in enumerate((clip, text)):
-            model = fitted(features[train[fit]], void[train[fit]])
-            evidence[held, k] = model.decision_function(features[train[held]])
-    of_test = [fitted(x[train], void[train]).decision_function(x[test]) for x in (clip, text)]
+    for fit, held in GroupKFold(2).split(train, groups=groups[train]):
+        for k, (fitted, seen) in enumerate(readers):
+            evidence[held, k] = fitted(seen[train[fit]], void[train[fit]]).decision_function(seen[train[held]])
+    of_test = [fitted(seen[train], void[train]).decision_function(seen[test]) for fitted, seen in readers]
     return LogisticRegression().fit(evidence, void[train]).predict(np.stack(of_test, axis=1))
 
 
@@ -196,10 +189,11 @@ def print_figures(rule: str, items: pd.DataFrame) -> None:
         correct=(~items["abstained"]).where(items["side"] == "control"),
     )
     row = robust(verdicts, resamples=1).iloc[0]
-    shares = items.groupby(["dataset", "side"])["abstained"].mean()
-    j = [f"{shares.get((d, 'void'), np.nan) - shares.get((d, 'control'), np.nan):5.2f}" for d in DATASETS]
-    print(f"  {rule:6} {row['pecs']:6.3f} {row['pecs_r']:6.3f}   {' '.join(j)}")
-    print("         abstains:", " ".join(f"{d}/{s[0]} {v:.2f}" for (d, s), v in shares.items() if d not in DATASETS))
+    shares = items.pivot_table(values="abstained", index="dataset", columns="side", aggfunc="mean")
+    control, j = shares["control"], shares["void"] - shares["control"]
+    pecs = float(np.mean([pecs_of(1 - control[dataset], j[dataset]) for dataset in DATASETS]))
+    figures = " ".join(f"{value:6.3f}" for value in (pecs, row["robust"], row["conjunction"]))
+    print(f"  {rule:6} {figures}  ", *(f"{j[dataset]:5.2f}" for dataset in (*DATASETS, CROSSED)))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Checkout
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
 from traps_pipeline.scoring.score_rows import HYPOTHESES, LEADERBOARD, ROBUST
@@ -49,14 +50,15 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     items = tables.read_all(ITEMS, dataset="crossed").set_index("item_id")
     pair = tables.read_all(ITEMS, dataset="chaotic").set_index("item_id")
     aside, foreign = (items.loc[f"crossed:plinko-0001:{side}"] for side in ("control", "void"))
-    assert (aside["clip"], aside["ground_truth"]) == (pair.loc["chaotic:plinko-0001:void", "clip"], "6")
+    answer = load_released()["plinko-0001"].answerable_question.answer
+    assert (aside["clip"], aside["ground_truth"]) == (pair.loc["chaotic:plinko-0001:void", "clip"], answer)
     assert (foreign["clip"], foreign["ground_truth"]) == (pair.loc["chaotic:plinko-0001:control", "clip"], None)
     robust = tables.read_all(ROBUST).set_index("model")
     board = tables.read_all(LEADERBOARD).query("dataset == 'overall'").set_index("model")
     figures = ["conjunction", "robust"]
     assert robust.loc["oracle", figures].tolist() == [1.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
-    assert robust.loc["any-rule", "conjunction"] == 0 and robust.loc["any-rule", "robust"] < 0.75
+    assert robust.loc["any-rule", "conjunction"] == 0 and robust.loc["any-rule", "robust"] < 0.8
     board_text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
     assert "all over 3 of 7 arms" in board_text and "nan" not in board_text and "no conjunction" not in board_text
     doses = tables.read_all(HYPOTHESES).set_index(["model", "hypothesis", "dose"])

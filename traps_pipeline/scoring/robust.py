@@ -91,16 +91,16 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
 def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
     """The columns of an entry's ROBUST row except model, regime and arms."""
     runs = dict(list(items.groupby("run", sort=True)))
-    sums, scenarios = run_sums(items, drawn, named), items.groupby(["dataset", "run"])["scenario_id"].nunique()
+    sums = run_sums(items, drawn, named)
     kinds = (*DATASETS, *(arm for arm in arms if arm in ROBUST_ARMS))
     conjunctions = [_conjunction(rows, drawn, f"{named}|conjunction") for rows in runs.values()]
     figures = {
         "robust": [
             robust_ends(
                 {kind: figures_of(sums[kind, cast(int, run)], in_mean=True) for kind in kinds},
-                {kind: int(scenarios[kind, run]) for kind in kinds},
+                {kind: rows.loc[rows["dataset"] == kind, "scenario_id"].nunique() for kind in kinds},
             )
-            for run in runs
+            for run, rows in runs.items()
         ],
         "conjunction": [ends for ends, _ in conjunctions],
     }
