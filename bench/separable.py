@@ -1,8 +1,8 @@
 """What is earned by abstaining for reasons of the clip alone or of the question alone (docs/scoring.md, "Beyond PECS").
 
 Two learned classifiers never meet: boosted trees read numbers of a clip (its length, where a board stands and from
-when, how much moves and when it rests), a regression reads the words of a question. The numbers come from the records, so
-that no picture is drawn: a reader of pixels knows them less well. Where a rule does not abstain it answers like an
+when, how much moves and when it rests), a regression reads the words of a question. The numbers come from the records,
+so that no picture is drawn: a reader of pixels knows them less well. Where a rule does not abstain it answers like an
 oracle, so that each figure bounds what it can earn. `or` and `and` join the two decisions, `sum` adds their evidence;
 `joint` is no such rule: one classifier that reads both. Each is fitted on other scenarios, or on other families, than
 it is asked about. The figures are the project's own (`scoring`).
