@@ -36,8 +36,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
-from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.capture import first_tensor
 from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, given, giving, unknown_path
 from traps_pipeline.models.local.spans import visual_tokens

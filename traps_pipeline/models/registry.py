@@ -21,7 +21,7 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
-from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
+from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
 from traps_pipeline.models.prompts import FIELDS, fields_of
 from traps_pipeline.models.thinking import Marks, marks_of
 from traps_pipeline.protocol.cells import Evaluation
@@ -214,6 +214,7 @@ class ModelEntry(Entry):
     groups: Groups = Groups(family="own", access="own", input="own", group="own")
     device: str | None = Field(default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1 or mps")
     mechanism: MechanismSpec | None = Field(default=None, description="of backend local: how it is looked into")
+    size: NetworkSize | None = Field(default=None, description="of backend local: for the hours of `traps plan`")
 
     @model_validator(mode="before")
     @classmethod
@@ -252,8 +253,8 @@ class ModelEntry(Entry):
                 self.local_params()
             except ValidationError as error:
                 raise ValueError(f"params: {explain(error)}") from error
-        elif self.device is not None or self.mechanism is not None:
-            raise ValueError("device, mechanism: only backend local has them")
+        elif (self.device, self.mechanism, self.size) != (None, None, None):
+            raise ValueError("device, mechanism, size: only backend local has them")
 
     def local_params(self) -> LocalParams:
         """`params` of backend local, checked. Raises pydantic's ValidationError."""

@@ -17,7 +17,6 @@ from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steered
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prefixes import PrefixMemory
 from traps_pipeline.models.local.prompt_batches import Prompt, batches
 from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.settings import LocalParams
@@ -61,7 +60,7 @@ class LocalModel:
         self.dtype, self.quantisation = params.dtype, params.quantisation
         self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
         self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)
-        self.clips, self.prefixes = ClipMemory(), PrefixMemory()
+        self.clips = ClipMemory()
         self._processing = Lock()  # tokenizers are not for several threads at once
         network.generation_config = self._plain_generation()
 
@@ -166,11 +165,6 @@ class LocalModel:
     def remembering_clips(self) -> AbstractContextManager[None]:
         """Inside, the vision tower sees each clip once (`clips`)."""
         return self.clips.remembering(self.network)
-
-    def resuming(self) -> AbstractContextManager[None]:
-        """Inside, steered answers are resumed at the steered block, and each prompt passes those below it once
-        (`prefixes`)."""
-        return self.prefixes.remembering()
 
     # --- hidden states ------------------------------------------------------------------------------------------------
 

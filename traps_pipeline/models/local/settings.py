@@ -45,6 +45,15 @@ class LocalParams(BaseModel):
         return self
 
 
+class NetworkSize(BaseModel):
+    """The size of a network, for `traps plan`. parameters_b: in billions. layers, width: of the language model."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    parameters_b: float = Field(gt=0)
+    layers: int = Field(ge=1)
+    width: int = Field(ge=1)
+
+
 class MechanismSpec(BaseModel):
     """How a model is loaded to look inside (docs/spec.md 7.1), where that differs from how it answers.
 
