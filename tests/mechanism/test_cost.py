@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.cli.__main__ import main
+from traps_pipeline.cli import main
 from traps_pipeline.mechanism.cost import Card, Work, cost_of, passes_inside
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS

@@ -15,8 +15,7 @@ from tests.build.video_rows import PARTITION, clip
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
-from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
-from traps_pipeline.ledger.transfer import export_ledger, import_ledger
+from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage import media
 from traps_pipeline.storage.benchmark_tables import VIDEOS
@@ -122,24 +121,6 @@ def test_a_ledger_on_a_full_disk_goes_on_once_there_is_space(tiny_disk: Path) ->
     assert set(local(tiny_disk).read("m").rows) == {"k", *(row["key"] for row in rows)}
 
 
-def test_an_address_that_is_exported_and_right_leads_to_the_database(
-    postgres: Postgres, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def export(address: str) -> Callable[[], None]:
-        return lambda: monkeypatch.setenv(VARIABLE, address)
-
-    def call() -> PostgresDatabase:
-        return postgres_of(VARIABLE, "remedied")
-
-    monkeypatch.delenv(VARIABLE, raising=False)
-    refused(call, "ledger.postgres.postgres_of")
-    export("postgresql://[half")()
-    refused(call, "ledger.postgres")
-    export(postgres.address(password="wrong"))()
-    session = remedied(call, "ledger.postgres", export(postgres.address()))
-    assert session.study_name == "remedied"
-
-
 def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgres) -> None:
     """The database's clock is altered: nobody may set this machine's."""
     psycopg = pytest.importorskip("psycopg")
@@ -160,17 +141,3 @@ def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgr
 
     session = remedied(lambda: PostgresDatabase(late, VARIABLE, "clocks"), "ledger.postgres", set_clock)
     assert session.exists()
-
-
-def test_a_ledger_is_exported_and_imported_once_what_stands_in_the_way_is_gone(tmp_path: Path) -> None:
-    one, two = local(tmp_path / "one").database, local(tmp_path / "two").database
-    write(local(tmp_path / "one"), answer("a", "left"))
-    file = tmp_path / "file.sqlite"
-    file.touch()
-    remedied(lambda: export_ledger(one, file), "ledger.transfer.export_ledger", file.unlink)
-    remedied(
-        lambda: import_ledger(tmp_path / "none.sqlite", two),
-        "ledger.transfer.import_ledger",
-        again=lambda: import_ledger(file, two),
-    )
-    assert [*local(tmp_path / "two").read("m").rows] == ["a"]
