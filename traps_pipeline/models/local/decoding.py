@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,7 +13,15 @@ from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from traps_pipeline.models.local.model import LocalModel
+
+class Decodes(Protocol):
+    """A `LocalModel`, as far as it is used here."""
+
+    network: Any
+
+    def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Inputs on the model's device."""
+        ...
 
 
 class Steers(Protocol):
@@ -28,13 +36,13 @@ class Steers(Protocol):
         ...
 
 
-def steered(steering: Steers | None, model: LocalModel) -> AbstractContextManager[None]:
+def steered(steering: Steers | None, model: Decodes) -> AbstractContextManager[None]:
     """The steering, or nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 
 def decode(
-    model: LocalModel,
+    model: Decodes,
     prompts: Sequence[Prompt],
     max_new_tokens: int,
     sampling: Sampling | None,
@@ -82,7 +90,7 @@ def decode(
                 nucleus.keep(going)
 
 
-def _without(model: LocalModel, inputs: dict[str, Any], out: Any, going: Sequence[int]) -> dict[str, Any]:
+def _without(model: Decodes, inputs: dict[str, Any], out: Any, going: Sequence[int]) -> dict[str, Any]:
     """What the rows that go on continue from: their tokens so far, and their part of the cache."""
     import torch
 
