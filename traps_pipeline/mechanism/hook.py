@@ -84,7 +84,7 @@ class Steering:
             return
         direction = torch.from_numpy(np.ascontiguousarray(self.direction, dtype=np.float32))
         added = torch.tensor(self.alphas, dtype=torch.float32)[:, None] * direction  # (rows, d), in float32 until here
-        added = added[:, None, :].to(model.device, model.network.dtype)
+        added = added[:, None, :].to(model.inputs_device, model.network.dtype)
 
         def add(states: Tensor) -> Tensor:
             if len(states) != len(added):

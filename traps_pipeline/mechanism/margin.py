@@ -63,7 +63,7 @@ def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -
 
     head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()
     states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
-    logits = head(states.to(model.device, model.network.dtype)).float()
+    logits = head(states.to(head.weight.device, model.network.dtype)).float()
     cap = getattr(config, "final_logit_softcapping", None)
     if cap:
         logits = torch.tanh(logits / cap) * cap

@@ -212,7 +212,9 @@ class ModelEntry(Entry):
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
     tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
     groups: Groups = Groups(family="own", access="own", input="own", group="own")
-    device: str | None = Field(default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1 or mps")
+    device: str | None = Field(
+        default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1, mps, or auto: all GPUs"
+    )
     mechanism: MechanismSpec | None = Field(default=None, description="of backend local: how it is looked into")
     size: NetworkSize | None = Field(default=None, description="of backend local: for the hours of `traps plan`")
 
@@ -248,7 +250,9 @@ class ModelEntry(Entry):
     def _check_local(self) -> None:
         if self.backend == LOCAL:
             if self.device is None:
-                raise ValueError("device: backend local needs it (cpu, cuda, cuda:1 or mps); it is not chosen for you")
+                raise ValueError(
+                    "device: backend local needs it (cpu, cuda, cuda:1, mps or auto); it is not chosen for you"
+                )
             try:
                 self.local_params()
             except ValidationError as error:

@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Dtype = Literal["float32", "bfloat16", "float16"]
 Quantisation = Literal["none", "nf4"]
-DEVICE = r"^(cpu|mps|cuda(:\d+)?)$"
+SPREAD = "auto"  # device of a model that is spread over all GPUs of the process, or lies on the CPU without any
+DEVICE = r"^(cpu|mps|auto|cuda(:\d+)?)$"
 
 
 class LocalParams(BaseModel):
