@@ -331,7 +331,7 @@ def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> No
     assert max(made.own_effects["gaps"]) == pytest.approx(20.0)
     (axes,) = next(report for report in FIGURES if report.name == "doses_among_nulls").make(made).axes
     assert axes.get_xlim()[1] < 2.5
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.5", "1", "+", "−"]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "1", "+", "−"]
 
 
 @pytest.mark.parametrize("name", ["gate_arrows", "doses_among_nulls"])
