@@ -162,6 +162,14 @@ class MechanismSettings(BaseModel):
     probes: ProbeSettings = ProbeSettings()
     gate: GateSettings = GateSettings()
     patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
+    sentences: tuple[str, ...] = Field(
+        default=(
+            "I don't know: this cannot be determined from the video.",
+            "I cannot tell from the video.",
+            "It is not possible to determine this from the video.",
+        ),
+        description="abstentions whose log-probability is read behind every item, a pass each; []: none",
+    )
     system: Literal["vqa", "benchmark"] = Field(
         default="vqa", description="system prompts of extraction: the short VQA ones, or the benchmark's own"
     )
