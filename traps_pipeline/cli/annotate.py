@@ -16,7 +16,10 @@ TOKEN_VARIABLE = "TRAPS_ANNOTATE_TOKEN"
 def add(commands: Commands) -> None:
     """Add `traps annotate`."""
     parser = commands.add(
-        "annotate", annotate, "pages on which people label clips and answers blindly; prints an address for each"
+        "people annotate",
+        annotate,
+        "serve pages on which people label clips and answers blindly; print an address for each",
+        example="--who jd ab",
     )
     user = os.environ.get("USER", "")
     parser.add_argument(

@@ -24,7 +24,7 @@ LOOKS = (
 def add(commands: Commands) -> None:
     """Add `traps certify` and `traps sample`."""
     text = "compute every certificate of the released records again"
-    parser = commands.add("certify", certify, text, workspace=False)
+    parser = commands.add("benchmark certify", certify, text, example="--families plinko", workspace=False)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
     parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
@@ -33,7 +33,9 @@ def add(commands: Commands) -> None:
     )
 
     text = "sample a fresh benchmark, certified like the released one"
-    parser = commands.add("sample", sample, text, workspace=False)
+    parser = commands.add(
+        "benchmark sample", sample, text, example="--seed 7 --out private --scale 0.1", workspace=False
+    )
     parser.add_argument(
         "--seed", type=whole(0, 2**63 - 1), required=True, help="the same seed gives the same scenarios"
     )

@@ -1,4 +1,4 @@
-"""`traps confabulation`: the judge's labels of void failures, compared with people's."""
+"""`traps people sheet`, `labels`, `validate`: the judge's labels of void failures, compared with people's."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace
 
 
 def add(commands: Commands) -> None:
-    """Add `traps confabulation sheet`, `labels` and `validate`."""
-    noun = commands.noun("confabulation", "compare labels of void failures with people's")
+    """Add `traps people sheet`, `labels` and `validate`."""
     for name, command, text in (
         ("sheet", make_sheet, "write a CSV of labelled failures, which people then label blindly"),
-        ("labels", write_labels, "write the labels that people gave on the pages of `traps annotate` as such a CSV"),
+        ("labels", write_labels, "write the labels that people gave on the pages of `traps people annotate` as a CSV"),
         ("validate", validate_judge, "compare the judge with the labels of two annotators"),
     ):
-        parser = noun.add(name, command, text)
+        parser = commands.add(f"people {name}", command, text, example="labels.csv")
         parser.add_argument("file", type=Path, help="CSV; see docs/judging.md for its columns")
 
 

@@ -11,7 +11,8 @@ from traps_pipeline.cli.command import FAILED, OK, Commands, place_of
 
 def add(commands: Commands) -> None:
     """Add `traps doctor`."""
-    parser = commands.add("doctor", doctor, "check this machine: render and encode a frame, and name what is missing")
+    text = "check this machine: render and encode a frame, and name what is missing"
+    parser = commands.add("study doctor", doctor, text, example="--verify", json=True)
     parser.add_argument(
         "--local",
         nargs="*",

@@ -11,7 +11,7 @@ from traps_pipeline.cli.command import FAILED, OK, Commands, entered, place_of
 def add(commands: Commands) -> None:
     """Add `traps models check`."""
     text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
-    parser = commands.noun("models", "check entries of the registry").add("check", check, text)
+    parser = commands.add("models check", check, text, example="mine.yaml --live", json=True)
     parser.add_argument(
         "names", nargs="*", metavar="MODEL", help="check only these models and judges, or all of an experiment (a path)"
     )

@@ -11,6 +11,7 @@ from traps_pipeline.base.terminal import text_table
 from traps_pipeline.cli.command import (
     OK,
     Commands,
+    add_experiment,
     add_panel,
     experiment_of,
     load_definitions,
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add `traps plan`."""
-    parser = commands.add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent")
-    parser.add_argument("experiment")
+    text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
+    parser = commands.add("study plan", plan, text, example="demo", json=True)
+    add_experiment(parser)
     add_panel(parser)
 
 

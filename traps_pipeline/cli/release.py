@@ -1,4 +1,4 @@
-"""`traps release`, `verify`, `commit`, `verify-commitment`: the folder that is published, and what proves it."""
+"""`traps publish release`, `verify`, `harness` and `traps benchmark commit`, `prove`: what is published, and proofs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add the commands of releases."""
     text = "write the folder that is published: clips, questions, labels, certificates, card, checksums"
-    parser = commands.add("release", release, text)
+    parser = commands.add("publish release", release, text, example="out --anonymous")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--arms", nargs="+", default=[], metavar="ARM", help="also the items and clips of these arms")
     parser.add_argument("--anonymous", action="store_true", help="name no author, for double-blind review")
@@ -31,13 +31,13 @@ def add(commands: Commands) -> None:
     parser.add_argument("--sign", type=Path, metavar="PEM", help="sign it with this private elliptic key")
 
     text = "name what was altered in a release, or what does not hold in a submission"
-    parser = commands.add("verify", verify, text, workspace=False)
+    parser = commands.add("publish verify", verify, text, example="out", workspace=False, json=True)
     parser.add_argument("path", type=Path, help="a folder of `traps release`, or a file of `traps submit`")
     parser.add_argument("--key", type=Path, metavar="PEM", help="of a release: check its signature, too")
     parser.add_argument("--release", type=Path, metavar="FOLDER", help="of a submission: hold its items against this")
 
     text = "write the folder with which inspect_ai and lmms-eval evaluate models on a release"
-    parser = commands.add("harness", harness, text, workspace=False)
+    parser = commands.add("publish harness", harness, text, example="out harness", workspace=False)
     parser.add_argument("release", type=Path, help="a folder that `traps release` wrote")
     parser.add_argument("folder", type=Path, help="an empty or new one")
     parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
@@ -47,13 +47,15 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
-    parser = commands.add("commit", commit_benchmark, text, workspace=False)
+    example = "private --out commitment.json --reveal reveal.json"
+    parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
     parser.add_argument("benchmark", type=Path, help="a folder that `traps sample` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
     parser.add_argument("--reveal", type=Path, required=True, metavar="FILE", help="the seed and a secret number")
 
     text = "prove that a revealed benchmark is the one that was committed"
-    parser = commands.add("verify-commitment", verify_commitment, text, workspace=False)
+    example = "commitment.json reveal.json --specs private"
+    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
     parser.add_argument("commitment", type=Path)
     parser.add_argument("reveal", type=Path)
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")

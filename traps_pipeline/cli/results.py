@@ -1,4 +1,4 @@
-"""`traps audit`, `export` and `compare`: check the published tables, write results, compare studies."""
+"""`traps results audit`, `export` and `compare`: check the published tables, write results, compare studies."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of
 
 
 def add(commands: Commands) -> None:
-    """Add `traps audit`, `traps export` and `traps compare`."""
+    """Add the commands of results."""
     text = "recompute published values from other published tables, and compare"
-    parser = commands.add("audit", audit_published, text, workspace=False)
+    parser = commands.add("results audit", audit_published, text, example="--all", workspace=False, json=True)
     parser.add_argument("--all", action="store_true", help="show also the statements that agree")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
-    parser = commands.add("export", export_results, "write every table, figure and page to a folder")
+    text = "write every table, figure and page to a folder"
+    parser = commands.add("results export", export_results, text, example="results")
     parser.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
 
-    parser = commands.add(
-        "compare", compare_studies, "print this study minus another on their common pairs, with paired intervals"
-    )
+    text = "print this study minus another on their common pairs, with paired intervals"
+    parser = commands.add("results compare", compare_studies, text, example=".workspaces/earlier", json=True)
     parser.add_argument("other", type=Path, help="folder of the other study, such as an earlier benchmark version")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every row to a file")
 

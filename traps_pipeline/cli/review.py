@@ -14,7 +14,8 @@ TOKEN_VARIABLE = "TRAPS_REVIEW_TOKEN"
 
 def add(commands: Commands) -> None:
     """Add `traps review`."""
-    parser = commands.add("review", review, "a page to review scenarios on: keep, correct, discard; prints its address")
+    text = "serve a page to review scenarios on: keep, correct, discard; print its address"
+    parser = commands.add("people review", review, text, example="--who jd")
     parser.add_argument("--who", default=os.environ.get("USER", ""), help="whose decisions these are (default: $USER)")
     add_listening(parser, port=3100, variable=TOKEN_VARIABLE)
 

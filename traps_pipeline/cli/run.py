@@ -17,6 +17,7 @@ from traps_pipeline.cli.command import (
     OK,
     OVER_BUDGET,
     Commands,
+    add_experiment,
     add_panel,
     experiment_of,
     load_definitions,
@@ -38,8 +39,9 @@ MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of
 
 def add(commands: Commands) -> None:
     """Add `traps run`."""
-    parser = commands.add("run", run, "materialize every missing or stale partition of an experiment")
-    parser.add_argument("experiment")
+    text = "make every missing or stale partition of an experiment, and print the leaderboard"
+    parser = commands.add("study run", run, text, example="demo --until leaderboard", is_paid=True, json=True)
+    add_experiment(parser)
     add_panel(parser)
     parser.add_argument(
         "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",

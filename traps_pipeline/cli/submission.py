@@ -1,4 +1,4 @@
-"""`traps submit`, `results` and `leaderboard`: a study as one file, in forms of others, and a page of many studies."""
+"""`traps publish submit`, `results` and `leaderboard`: a study as one file, in forms of others, and a page of many studies."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace
 
 
 def add(commands: Commands) -> None:
-    """Add `traps submit`, `traps results` and `traps leaderboard`."""
-    parser = commands.add("submit", submit, "pack a study's items, answers, votes and numbers into one file")
+    """Add `traps publish submit`, `results` and `leaderboard`."""
+    text = "pack a study's items, answers, votes and numbers into one file"
+    parser = commands.add("publish submit", submit, text, example="mine.zip --name mine")
     parser.add_argument("file", type=Path, help="the zip to write")
     parser.add_argument("--name", required=True, help="of the submission: lower-case letters, digits, - and .")
 
     text = "write the leaderboard as the hub's .eval_results, as Every Eval Ever JSON, and as Parquet"
-    parser = commands.add("results", results, text)
+    parser = commands.add("publish results", results, text, example="results --dataset owner/name")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--dataset", required=True, metavar="OWNER/NAME", help="repository of the release on the hub")
     parser.add_argument("--organization", default="unknown", help="who made the evaluation")
     parser.add_argument("--developer", default="unknown", help="of the models, as the hub names it")
 
     text = "verify submissions, and make one page of them; other versions or panels are not ranked together"
-    parser = commands.add("leaderboard", leaderboard, text, workspace=False)
+    parser = commands.add("publish leaderboard", leaderboard, text, example="mine.zip --out board", workspace=False)
     parser.add_argument("submissions", type=Path, nargs="+", help="files of `traps submit`, or folders of such files")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="of the page and its table")
     parser.add_argument("--release", type=Path, metavar="FOLDER", help="hold items and clips against this release")
