@@ -178,7 +178,7 @@ def alter(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
 def test_certify_passes_what_is_released_and_names_what_is_altered(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["certify", "--specs", str(folder), "--workers", "1"]
+    command = ["benchmark", "certify", "--specs", str(folder), "--workers", "1"]
     assert main(command) == 0
     said = capsys.readouterr()
     assert "1 of 1 scenarios certified" in said.out

@@ -107,13 +107,6 @@ def test_a_second_run_asks_and_renders_nothing(demo_study: Checkout) -> None:
 
 def test_status_calls_everything_fresh_and_plan_has_nothing_new(demo_study: Checkout) -> None:
     status = demo_study.traps("status", "demo").out
-    for stage, partitions in (
-        ("scene_specs", 4),
-        ("items", 4),
-        ("responses", 108),
-        ("verdicts", 108),
-        ("leaderboard", 1),
-    ):
-        assert re.search(rf"^{stage} +{partitions} +0 +0$", status, re.MULTILINE), status
+    assert re.search(r"^all \d+ partitions of \d+ stages are fresh$", status, re.MULTILINE), status
     plan = demo_study.traps("plan", "demo").out
     assert re.search(r"^all +3,456 +3,456 +0 +15,552 +15,552 +0$", plan, re.MULTILINE), plan

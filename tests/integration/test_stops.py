@@ -96,7 +96,7 @@ def test_no_process_of_a_run_outlives_it(background: Background, stop: signal.Si
 
 def test_the_page_of_reviews_ends(background: Background, small: Checkout) -> None:
     background.environment["TRAPS_WORKSPACE"] = str(small.workspace)
-    pid = background.traps("review", "--who", "jd", "--port", str(background.port), "--token", TOKEN)
+    pid = background.traps("people", "review", "--who", "jd", "--port", str(background.port), "--token", TOKEN)
     background.wait_until(lambda: _listens(background.port))
     os.kill(pid, signal.SIGTERM)
     wait_until_gone(background.mark, END_S)

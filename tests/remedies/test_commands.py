@@ -77,7 +77,15 @@ def test_an_export_in_batches_is_of_models_with_a_provider(unasked_copy: Workspa
     (tmp_path / "here.yaml").write_text(yaml.safe_dump(asks | {"models": ["oracle", "prior"]}))
 
     def export(experiment: str, out: str, *more: str) -> Callable[[], None]:
-        said = ["requests", "export", tmp_path / experiment, "--out", tmp_path / out, "--workspace", unasked_copy.root]
+        said = [
+            "study",
+            "export-requests",
+            tmp_path / experiment,
+            "--out",
+            tmp_path / out,
+            "--workspace",
+            unasked_copy.root,
+        ]
         return lambda: command(*said, *more)
 
     elsewhere = ("--media-at", "https://media.example.org")
@@ -115,7 +123,7 @@ def test_a_budget_is_given_in_dollars(unasked_copy: Workspace) -> None:
 def test_a_file_is_written_once_its_folder_is_made(unasked_copy: Workspace, tmp_path: Path) -> None:
     out = tmp_path / "gone" / "audit.csv"
     remedied(
-        lambda: command("audit", "--csv", out),
+        lambda: command("results", "audit", "--csv", out),
         "cli",
         lambda: out.parent.mkdir(),
         error=OSError,
@@ -138,14 +146,14 @@ def test_who_reviews_or_labels_is_said_once_each_in_plain_letters(small: Checkou
 
     at = ("--workspace", root, "--token", "token-of-a-reviewer-0123")
     remedied(
-        lambda: command("review", *at, "--who", " "),
+        lambda: command("people", "review", *at, "--who", " "),
         "cli.review.review",
         again=listens("review", "jd"),
     )
     for wrong in (("jd", "jd"), ("j d",)):
-        refused(lambda wrong=wrong: command("annotate", *at, "--who", *wrong), "cli.annotate.annotate")
+        refused(lambda wrong=wrong: command("people", "annotate", *at, "--who", *wrong), "cli.annotate.annotate")
     remedied(
-        lambda: command("annotate", *at, "--who", "jd", "jd"),
+        lambda: command("people", "annotate", *at, "--who", "jd", "jd"),
         "cli.annotate.annotate",
         again=listens("annotate", "jd", "ab"),
     )

@@ -111,14 +111,14 @@ def test_a_sheet_is_written_once_there_are_labels_of_these_answers(tmp_path: Pat
     workspace.tables.write(CONFABULATION, {}, [], {})
     (tmp_path / "labels.csv").write_text(f"{HEAD}\n")
     remedied(
-        lambda: command("confabulation", "sheet", sheet, *at),
+        lambda: command("people", "sheet", sheet, *at),
         "people.judge_validation.sheet_rows",
         lambda: workspace.tables.write(CONFABULATION, {}, labels, {}),
     )
     remedied(
-        lambda: command("confabulation", "sheet", sheet, *at),
+        lambda: command("people", "sheet", sheet, *at),
         "people.judge_validation.write_sheet",
-        again=lambda: command("confabulation", "sheet", tmp_path / "other.csv", *at),
+        again=lambda: command("people", "sheet", tmp_path / "other.csv", *at),
     )
     remedied(
         lambda: write_sheet(annotation_sheet(workspace), sheet),
@@ -150,7 +150,7 @@ def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: 
     written(tmp_path, HEAD, *(f"{who},{sample},1,0,no,TRUE" for who in ("ann", "bob")))
     workspace.tables.write(CONFABULATION, {}, [], {})
     remedied(
-        lambda: command("confabulation", "validate", path, "--workspace", workspace.root),
+        lambda: command("people", "validate", path, "--workspace", workspace.root),
         "people.judge_validation.validate",
         lambda: workspace.tables.write(CONFABULATION, {}, labels, {}),
     )

@@ -110,14 +110,14 @@ def test_what_traps_release_wrote_is_verified(release: Path, tmp_path: Path) -> 
         again=lambda: read_checksums(release),
     )
     remedied(
-        lambda: command("verify", tmp_path),
+        lambda: command("publish", "verify", tmp_path),
         "release.checksums.read_checksums",
-        again=lambda: command("verify", release),
+        again=lambda: command("publish", "verify", release),
     )
 
 
 def test_a_release_has_a_date_that_is_one(small: Checkout, tmp_path: Path) -> None:
-    said = ["release", tmp_path / "out", "--workspace", small.workspace, "--date"]
+    said = ["publish", "release", tmp_path / "out", "--workspace", small.workspace, "--date"]
     remedied(
         lambda: command(*said, "22.11.2026"),
         "cli.release._date",
@@ -163,9 +163,9 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     assert told in verify(submission).unchecked
     assert told not in verify(submission, release).unchecked
     remedied(
-        lambda: command("verify", path, "--key", tmp_path / "key.pub"),
+        lambda: command("publish", "verify", path, "--key", tmp_path / "key.pub"),
         "cli.release.verify",
-        again=lambda: command("verify", path),
+        again=lambda: command("publish", "verify", path),
     )
     root = tmp_path / "study"
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
@@ -198,7 +198,7 @@ def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(committe
     )
     files = [copy / "commitment.json", copy / "reveal.json"]
     remedied(
-        lambda: command("verify-commitment", *files, "--without-drawing"),
+        lambda: command("benchmark", "prove", *files, "--without-drawing"),
         "cli.release.verify_commitment",
-        again=lambda: command("verify-commitment", *files, "--without-drawing", "--specs", committed / "private"),
+        again=lambda: command("benchmark", "prove", *files, "--without-drawing", "--specs", committed / "private"),
     )

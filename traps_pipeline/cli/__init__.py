@@ -60,8 +60,8 @@ START = """TRAPSBench: do vision-language models know when not to answer?
 
 {groups}
 
-`traps GROUP --help` lists its commands, `traps COMMAND --help` shows an example; `traps completion bash` prints what a
-shell needs to complete them."""
+A group lists its commands, and `--help` behind a command shows an example. `traps completion bash` prints what a shell
+needs to complete them."""
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
@@ -147,7 +147,9 @@ def build_parser() -> Parser:
         short=SHORT,
     )
     parser.set_defaults(command=_show_start, parser=parser)
-    parser.add_argument("--version", dest="command", action="store_const", const=_show_version, help="print the version")
+    parser.add_argument(
+        "--version", dest="command", action="store_const", const=_show_version, help="print the version"
+    )
     commands = Commands(parser, GROUPS)
     for module in (
         doctor,

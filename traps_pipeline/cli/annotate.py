@@ -1,4 +1,4 @@
-"""`traps annotate`: pages on which people label clips and answers, without knowing whose they are."""
+"""`traps people annotate`: pages on which people label clips and answers, without knowing whose they are."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TOKEN_VARIABLE = "TRAPS_ANNOTATE_TOKEN"
 
 
 def add(commands: Commands) -> None:
-    """Add `traps annotate`."""
+    """Add `traps people annotate`."""
     parser = commands.add(
         "people annotate",
         annotate,
@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
 
 
 def annotate(arguments: argparse.Namespace) -> int:
-    """See `traps annotate --help`."""
+    """See `traps people annotate --help`."""
     require("web")
     from traps_pipeline.servers.annotate import Annotation, annotation_app
     from traps_pipeline.servers.server import serve
@@ -42,7 +42,7 @@ def annotate(arguments: argparse.Namespace) -> int:
             "`@`, e.g. --who jd ab"
         )
     listening = listening_of(
-        arguments, "annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
+        arguments, "people annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
     )
     workspace = open_workspace(arguments)
     if workspace.is_shared:

@@ -12,7 +12,8 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from traps_pipeline.base.suggestions import did_you_mean, nearest
@@ -57,8 +58,8 @@ def number(above: float, most: float) -> Callable[[str], float]:
 
 class Parser(argparse.ArgumentParser):
     """A parser that suggests the nearest word for an unknown one, and knows commands of daily use without their group.
-    `commands` holds the parser of every command below it by its name, such as `study run`. short: the groups of commands
-    that can be given without one."""
+    `commands` holds the parser of every command below it by its name, such as `study run`. short: the groups of
+    commands that can be given without one."""
 
     def __init__(self, *, short: Mapping[str, str] | None = None, **settings: Any) -> None:
         super().__init__(**settings)
@@ -69,7 +70,7 @@ class Parser(argparse.ArgumentParser):
         """Return the options of the command."""
         return [*dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*", self.format_help()))]
 
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:
+    def parse_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
         """See `argparse`. An unknown option is told by the command that it was given to."""
         words = [*(sys.argv[1:] if args is None else args)]
         if words and words[0] in self._short:
@@ -84,9 +85,11 @@ class Parser(argparse.ArgumentParser):
         """See `argparse`."""
         wrong = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
         if wrong and wrong[1] in (None, METAVAR):
-            last = {path.split()[-1]: path for path in self.commands}
-            near = nearest(wrong[2], [*last, *(path.split()[0] for path in self.commands)])
-            hint = f"; did you mean `traps {last.get(near, near)}`?" if near else f"; `{self.prog} --help` lists them"
+            own, last = re.findall(r"[\w-]+", wrong[3]), {path.split()[-1]: path for path in self.commands}
+            near = nearest(wrong[2], [*own, *self._short]) or nearest(wrong[2], last)
+            name = f"{self.prog} {near}" if near in own else f"traps {last.get(near or '') or near}"
+            name = f"traps {near}" if near in self._short else name
+            hint = f"; did you mean '{name}'?" if near else f"; `{self.prog} --help` lists them"
             message = f"unknown command {plain(wrong[2])[:40]!r}{hint}"
         elif wrong:
             message += did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3]))
@@ -125,7 +128,9 @@ class Commands:
         group, _, name = path.rpartition(" ")
         over = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
         codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {over}{INTERRUPTED} interrupted"
-        shown = f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
+        shown = (
+            f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
+        )
         parser = self._parsers[group].add_parser(
             name, help=text, description=text, epilog=shown + codes, formatter_class=_Help
         )
@@ -160,15 +165,17 @@ def _as_json(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | int):
         return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if is_dataclass(value):
+        return {each.name: _as_json(getattr(value, each.name)) for each in fields(value)}
     if isinstance(value, Mapping):
         return {str(key): _as_json(each) for key, each in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_as_json(each) for each in value]
     if hasattr(value, "to_dict"):  # a frame
         return _as_json(value.to_dict("records"))
     if hasattr(value, "item"):  # a number of numpy's
         return _as_json(value.item())
-    return str(value)
+    return [_as_json(each) for each in value] if isinstance(value, Iterable) else str(value)
 
 
 def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) -> None:

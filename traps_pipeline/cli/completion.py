@@ -34,7 +34,10 @@ def completion(arguments: argparse.Namespace) -> int:
     """See `traps completion --help`."""
     from traps_pipeline.cli import build_parser
 
-    commands, experiments = build_parser().commands, sorted(path.stem for path in (ASSETS / "experiments").glob("*.yaml"))
+    commands, experiments = (
+        build_parser().commands,
+        sorted(path.stem for path in (ASSETS / "experiments").glob("*.yaml")),
+    )
     groups = dict.fromkeys(path.split()[0] for path in commands if " " in path)
     cases = list[str]()
     for path, parser in commands.items():
@@ -42,7 +45,7 @@ def completion(arguments: argparse.Namespace) -> int:
         patterns = [f"'{path}'"] if group else [f"'{name} '*"]
         patterns += [f"'{name} '*"] if name in SHORT else []
         words = [*parser.options(), *(experiments if "experiment" in parser.format_usage() else ())]
-        cases.append(f"      {'|'.join(patterns)}) words=\"{' '.join(words)}\" ;;")
+        cases.append(f'      {"|".join(patterns)}) words="{" ".join(words)}" ;;')
     for group in groups:
         names = " ".join(path.split()[1] for path in commands if path.startswith(f"{group} "))
         cases.append(f"      '{group} '*) words=\"{names}\" ;;")

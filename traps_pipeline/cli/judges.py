@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from traps_pipeline.cli.command import OK, Commands, open_workspace
+from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
@@ -22,6 +22,9 @@ def check(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     name = arguments.panel or workspace.study.panel
     rows = check_panel(workspace, name, load_panel(name), load_attacks())
+    if arguments.json:
+        print_json(rows)
+        return OK
     print(f"panel {name}: votes on {rows['attack'].nunique()} answers that try to instruct the judge")
     print(summary(rows))
     print("flipped: right on the plain answer, wrong under the attack; broken: no valid vote under it")

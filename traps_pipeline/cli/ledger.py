@@ -1,4 +1,4 @@
-"""`traps study export-ledger`, `import-ledger`, `move`, `release-money`: answers, votes and money, moved as they are, and money given back."""
+"""`traps study export-ledger`, `import-ledger`, `move`, `release-money`: answers, votes and money of a study."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, open_workspace
+from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
@@ -39,6 +39,9 @@ def release(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     if arguments.participant is None:
         rooms = releasing.releasable(workspace)
+        if arguments.json:
+            print_json(rooms)
+            return OK
         rows = [(name, f"{room.in_flight:.4f}", f"{room.failed:.4f}") for name, room in rooms.items()]
         print(text_table(("participant", "in flight ($)", "failed ($)"), rows) if rows else "nothing may be released")
         return OK

@@ -17,6 +17,7 @@ from traps_pipeline.cli.command import (
     load_definitions,
     open_workspace,
     place_of,
+    print_json,
 )
 
 if TYPE_CHECKING:
@@ -44,6 +45,9 @@ def plan(arguments: argparse.Namespace) -> int:
         workspace.study if workspace else None, arguments.panel, judged_by_rules=arguments.judged_by_rules
     )
     planned = make_plan(workspace, experiment, study)
+    if arguments.json:
+        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
+        return OK
     total = (Count(), Count())
     print(f"{experiment.name} in {place if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
@@ -111,7 +115,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     print(f"\n{text_table(headings, rows)}")
     in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if in_batches < total[1]:
-        print(f"expected if all calls are made in batches (traps requests export --batch): USD {in_batches:,.2f}")
+        print(f"expected if all calls are made in batches (traps study export-requests --batch): USD {in_batches:,.2f}")
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(f"price unknown, not in the sum: {unknown}")

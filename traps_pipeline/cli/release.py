@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
+from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace, print_json, whole
 from traps_pipeline.cli.submission import verify_file
 
 if TYPE_CHECKING:
@@ -26,19 +26,23 @@ def add(commands: Commands) -> None:
         "--without-answers", type=Path, metavar="KEY",
         help="a held-out set: items under opaque names, which only this file tells (it is made where it is missing)",
     )  # fmt: skip
-    parser.add_argument("--commitment", type=Path, metavar="FILE", help="publish a file of `traps commit` with it")
+    parser.add_argument(
+        "--commitment", type=Path, metavar="FILE", help="publish a file of `traps benchmark commit` with it"
+    )
     parser.add_argument("--date", metavar="YYYY-MM-DD", help="of the publication, for the descriptions")
     parser.add_argument("--sign", type=Path, metavar="PEM", help="sign it with this private elliptic key")
 
     text = "name what was altered in a release, or what does not hold in a submission"
     parser = commands.add("publish verify", verify, text, example="out", workspace=False, json=True)
-    parser.add_argument("path", type=Path, help="a folder of `traps release`, or a file of `traps submit`")
+    parser.add_argument(
+        "path", type=Path, help="a folder of `traps publish release`, or a file of `traps publish submit`"
+    )
     parser.add_argument("--key", type=Path, metavar="PEM", help="of a release: check its signature, too")
     parser.add_argument("--release", type=Path, metavar="FOLDER", help="of a submission: hold its items against this")
 
     text = "write the folder with which inspect_ai and lmms-eval evaluate models on a release"
     parser = commands.add("publish harness", harness, text, example="out harness", workspace=False)
-    parser.add_argument("release", type=Path, help="a folder that `traps release` wrote")
+    parser.add_argument("release", type=Path, help="a folder that `traps publish release` wrote")
     parser.add_argument("folder", type=Path, help="an empty or new one")
     parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
     parser.add_argument(
@@ -49,7 +53,7 @@ def add(commands: Commands) -> None:
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
     example = "private --out commitment.json --reveal reveal.json"
     parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
-    parser.add_argument("benchmark", type=Path, help="a folder that `traps sample` wrote")
+    parser.add_argument("benchmark", type=Path, help="a folder that `traps benchmark sample` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
     parser.add_argument("--reveal", type=Path, required=True, metavar="FILE", help="the seed and a secret number")
 
@@ -64,7 +68,7 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    """See `traps release --help`."""
+    """See `traps publish release --help`."""
     from traps_pipeline.base.extras import require
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
@@ -87,7 +91,7 @@ def release(arguments: argparse.Namespace) -> int:
         print(f"which item is which, for you alone: {written.answers}")
     if arguments.sign:
         print(f"signature: {sign(target, arguments.sign)}")
-    print(f"next: read {target / CARD}; traps verify {target}")
+    print(f"next: read {target / CARD}; traps publish verify {target}")
     return OK
 
 
@@ -102,19 +106,22 @@ def _date(text: str | None) -> str | None:
 
 
 def verify(arguments: argparse.Namespace) -> int:
-    """See `traps verify --help`."""
+    """See `traps publish verify --help`."""
     from traps_pipeline.release.checksums import altered_files, read_checksums
 
     if not arguments.path.is_dir():
         if arguments.key:
             raise TrapsError(f"--key: only folders are signed, and {arguments.path} is none; leave it out")
-        return verify_file(arguments.path, arguments.release)
+        return verify_file(arguments.path, arguments.release, is_json=arguments.json)
     problems = altered_files(arguments.path)
     if arguments.key:
         from traps_pipeline.release.signing import check_signature
 
         wrong = check_signature(arguments.path, arguments.key)
         problems += [wrong] if wrong else []
+    if arguments.json:
+        print_json({"problems": problems, "files": len(read_checksums(arguments.path))})
+        return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:
@@ -125,7 +132,7 @@ def verify(arguments: argparse.Namespace) -> int:
 
 
 def harness(arguments: argparse.Namespace) -> int:
-    """See `traps harness --help`."""
+    """See `traps publish harness --help`."""
     from traps_pipeline.release.harness.write import LMMS, shown, write_harness
 
     target = arguments.folder.absolute()
@@ -137,7 +144,7 @@ def harness(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
-    """See `traps commit --help`."""
+    """See `traps benchmark commit --help`."""
     from traps_pipeline.release.commitment import commit
 
     made = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
@@ -147,7 +154,7 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
 
 
 def verify_commitment(arguments: argparse.Namespace) -> int:
-    """See `traps verify-commitment --help`."""
+    """See `traps benchmark prove --help`."""
     from traps_pipeline.release import commitment as sealed
 
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of
+from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, print_json
 
 
 def add(commands: Commands) -> None:
@@ -28,19 +29,22 @@ def add(commands: Commands) -> None:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """See `traps audit --help`. Discrepancies of the published tables are findings, not failures."""
+    """See `traps results audit --help`. Discrepancies of the published tables are findings, not failures."""
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()
-    print(audit_text(findings, arguments.all))
+    if arguments.json:
+        print_json(findings)
+    else:
+        print(audit_text(findings, arguments.all))
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(findings))
-        print(f"every finding: {arguments.csv}")
+        print(f"every finding: {arguments.csv}", file=sys.stderr)
     return OK
 
 
 def export_results(arguments: argparse.Namespace) -> int:
-    """See `traps export --help`."""
+    """See `traps results export --help`."""
     from traps_pipeline.report.publish import INDEX, export
 
     workspace = open_workspace(arguments)
@@ -51,7 +55,7 @@ def export_results(arguments: argparse.Namespace) -> int:
 
 
 def compare_studies(arguments: argparse.Namespace) -> int:
-    """See `traps compare --help`."""
+    """See `traps results compare --help`."""
     from traps_pipeline.judging.judging_rows import VERDICTS
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
@@ -62,6 +66,9 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     table = version_contrasts(then, now)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))
+    if arguments.json:
+        print_json(table)
+        return OK
     words = {True: "yes", False: "no"}
     separable = [words.get(value, "too few") for value in table["separable"]]
     separable = ["-" if p != p else word for word, p in zip(separable, table["p"], strict=True)]

@@ -22,6 +22,7 @@ from traps_pipeline.cli.command import (
     experiment_of,
     load_definitions,
     number,
+    print_json,
     whole,
 )
 from traps_pipeline.cli.init import create
@@ -95,13 +96,15 @@ def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
     from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import make_progress
+    from traps_pipeline.scoring.score_rows import LEADERBOARD
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
     load_definitions()
     from traps_pipeline.pipeline.experiment_run import run_experiment
 
-    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
+    about = sys.stderr if arguments.json else sys.stdout
+    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", file=about, flush=True)
     with reporting(make_progress(arguments.progress)) as shown:
         report = run_experiment(
             workspace,
@@ -111,16 +114,22 @@ def run(arguments: argparse.Namespace) -> int:
             look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
             open_runs=partial(_open_runs, arguments),
         )
-    _print_work(report, is_inside=experiment.mechanism is not None)
+    if not arguments.json:
+        _print_work(report, is_inside=experiment.mechanism is not None)
     if experiment.canary and not report.problems:
         from traps_pipeline.checks.canary import ask_canary, changes_text
 
         with reporting(make_progress(arguments.progress)):
             changes = ask_canary(workspace, experiment.models)
-        print(changes_text(changes))
+        print(changes_text(changes), file=about)
+    if arguments.json:
+        board = workspace.tables.read_all(LEADERBOARD)
+        print_json({"workspace": str(workspace.place), "run": report, "leaderboard": board})
     if report.problems:
         _print_problems(report.problems)
         return OVER_BUDGET if report.over_budget else FAILED
+    if arguments.json:
+        return OK
     if arguments.until is not None:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK

@@ -53,7 +53,7 @@ def status(arguments: argparse.Namespace) -> int:
     if arguments.json:
         names = ("check", "stage", "partition", "reason")
         failing = [dict(zip(names, check, strict=True)) for check in checks]
-        print_json({"workspace": workspace.place, "command": command, "checks": failing, "stages": list(map(vars, rows))})
+        print_json({"workspace": str(workspace.place), "command": command, "checks": failing, "stages": rows})
         return OK
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
