@@ -70,7 +70,9 @@ class Parser(argparse.ArgumentParser):
         """Return the options of the command."""
         return [*dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*", self.format_help()))]
 
-    def parse_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
+    def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
+        self, args: Iterable[str] | None = None, namespace: Any = None
+    ) -> Any:
         """See `argparse`. An unknown option is told by the command that it was given to."""
         words = [*(sys.argv[1:] if args is None else args)]
         if words and words[0] in self._short:

@@ -76,7 +76,7 @@ def _chapters(
     for report in sorted(FIGURES, key=lambda report: report.name not in first):
         paths = [(r.source, path) for r in (study, paper) for path in [report.path(r)] if path in pictures]
         blocks = [picture_block(source, pictures[path]) for source, path in paths]
-        figures.append(Card(f"figure-{report.name}", report.title, blocks, report.doc))
+        figures.append(Card(f"figure-{report.name}", report.title, blocks, report.note(study)))
     tables = []
     for report in TABLES:
         own = report.tables(study)

@@ -1,0 +1,150 @@
+"""What the lead figures inside models say of a study, in one sentence a model, from the frames that they draw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.report.figures.expression_figures import orders, scored_items
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.control_reports import beside
+from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ALPHA = 0.05 + 1e-9
+_CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
+
+
+def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    for model, of in rows.groupby("model", sort=False, observed=True):
+        yield plain(str(model)), of
+
+
+def states_and_output(results: Results) -> str:
+    """How many voids that were answered states and output put among voids, and how well either orders the sides."""
+    sentences = list[str]()
+    for model, of in _models(scored_items(results)):
+        voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
+        controls = of.loc[of["side"] == "control"]
+        if not len(voids):
+            sentences.append(f"{model} answered no void under standard: nothing is encoded and not expressed.")
+            continue
+        encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
+        wrongly = int((controls["own"] > 0).sum())
+        areas = [orders(part) for _, part in of.groupby("dataset", sort=False, observed=True)]
+        states, output = (sum(area) / len(areas) for area in zip(*areas, strict=True))
+        sentences.append(
+            f"{model} answered {len(voids)} voids under standard: its states put {encoded} of them among voids (and "
+            f"{wrongly} of {len(controls)} controls), its output {expressed}; as an order of the sides, the AUROC of "
+            f"states is {states:.2f} and of output {output:.2f} (mean of datasets)."
+        )
+    return " ".join(sentences)
+
+
+def lens(results: Results) -> str:
+    """By how much the guided prompt moves the margin of each side at the last layer and at the one before."""
+    sentences = list[str]()
+    for model, of in _models(results.lens):
+        means = of.groupby(["prompt", "layer"], observed=True).agg(
+            voids=("voids", "mean"), controls=("controls", "mean")
+        )
+        at = {(row["prompt"], row["layer"]): row for row in means.reset_index().to_dict("records")}
+        top = max(layer for _, layer in at)
+        if not all((prompt, layer) in at for prompt in PROMPTING for layer in (top, top - 1)):
+            continue
+        moved = [
+            at["guided", layer][side] - at["standard", layer][side]
+            for layer in (top, top - 1)
+            for side in ("voids", "controls")
+        ]
+        sentences.append(
+            f"In {model} the guided prompt moves the log-odds of abstaining by {moved[0]:+.1f} on voids and "
+            f"{moved[1]:+.1f} on controls at the last layer, and by {moved[2]:+.1f} and {moved[3]:+.1f} one layer "
+            "before (means over datasets)."
+        )
+    return " ".join(sentences)
+
+
+def probe_baselines(results: Results) -> str:
+    """On how many pairs states are above every raw input, the margin and the noise; within and across datasets."""
+    sentences = list[str]()
+    for model, of in _models(beside(results)):
+        states, noise, spread = (of[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
+        beaten = np.column_stack([of[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
+        above, across = states > np.fmax.reduce(beaten, axis=1), (of["source"] != of["target"]).to_numpy(bool)
+        counts = [f"{np.count_nonzero(above & kind)} of {np.count_nonzero(kind)}" for kind in (across, ~across)]
+        sentences.append(
+            f"{model}: states are above every raw input, the output margin and noise on {counts[0]} pairs of datasets, "
+            f"and on {counts[1]} datasets themselves."
+        )
+    return " ".join(sentences)
+
+
+def gate_arrows(results: Results) -> str:
+    """What the default gate does to PECS, beside the best gate on anything else than states."""
+    rows = results.gate
+    rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
+    sentences = list[str]()
+    for model, of in _models(rows.loc[rows["pecs"].notna()]):
+        for regime, part in of.groupby("regime", sort=False, observed=True):
+            gates = {row["features"]: row for row in part.to_dict("records")}
+            own = gates.pop("states", None)
+            if own is None or not gates:
+                continue
+            best = max(gates.values(), key=lambda row: row["pecs"])
+            sentences.append(
+                f"{model} under {regime}: a gate on states takes PECS from {own['plain_pecs']:.2f} to "
+                f"{own['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
+            )
+    return " ".join(sentences)
+
+
+def doses_among_nulls(results: Results) -> str:
+    """Where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
+    rows = results.nulls
+    sentences = list[str]()
+    for model, of in _models(rows.loc[rows["target"] != "all"]):
+        cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+        for row in of.to_dict("records"):
+            about = {str(name): value for name, value in row.items()}
+            cells.setdefault(tuple(about[name] for name in _CELL), []).append(about)
+        ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
+        best = max(ahead, key=lambda row: row["effect"], default=None)
+        sentences.append(
+            f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of {len(cells)} cells"
+            + (f", most of all {_cell(best)}." if best else ".")
+        )
+    return " ".join(sentences)
+
+
+def _cell(row: dict[str, Any]) -> str:
+    moved = "more" if row["side"] == "control" else "fewer"
+    return (
+        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']}, where {row['effect']:.0%} {moved} of {row['n']} "
+        f"{row['side']}s are abstained on"
+    )
+
+
+def patching(results: Results) -> str:
+    """The group of positions that carries most of the difference at the first layer and at the last."""
+    rows = results.patching
+    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
+    sentences = list[str]()
+    for model, of in _models(rows.loc[rows["group"] != "all"]):
+        means = of.groupby(["layer", "group"], observed=True).agg(effect=("effect", "mean")).reset_index()
+        first, last = (
+            max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
+            for layer in (of["layer"].min(), of["layer"].max())
+        )
+        sentences.append(
+            f"In {model} the difference of the output is carried by {first['group']} tokens at the embeddings "
+            f"({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."
+        )
+    return " ".join(sentences)
