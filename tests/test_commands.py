@@ -32,6 +32,7 @@ MAKEFILE = {
 TESTS = {path.relative_to(ROOT / "tests").as_posix(): path.read_text() for path in (ROOT / "tests").rglob("*.py")}
 # A test runs these by other words: the file, and the words.
 RUN_AS = {
+    "traps people review": ("integration/test_review.py", 'listening(study, "review"'),
     "traps study import-votes": ("integration/test_batches.py", 'f"import-{what}"'),
     "inspect eval": ("release/test_pocket_harness.py", '"-m", "inspect_ai", "eval"'),
     "make docs": ("test_docs_site.py", '"make", "-C", checkout'),
