@@ -44,13 +44,13 @@ def test_no_command_shows_where_to_start_and_a_group_its_commands(capsys: pytest
 @pytest.mark.parametrize(
     ("words", "hint"),
     [
-        (["sttaus"], "did you mean 'traps status'?"),
-        (["certify"], "did you mean 'traps benchmark certify'?"),
-        (["reslts"], "did you mean 'traps results'?"),
-        (["study", "expot-votes"], "did you mean 'traps study export-votes'?"),
+        (["sttaus"], "did you mean `traps status`?"),
+        (["certify"], "did you mean `traps benchmark certify`?"),
+        (["reslts"], "did you mean `traps results`?"),
+        (["study", "expot-votes"], "did you mean `traps study export-votes`?"),
         (["zzz"], "unknown command 'zzz'; `traps --help` lists them"),
-        (["run", "demo", "--budgt-usd", "3"], "did you mean '--budget-usd'?"),
-        (["run", "demo", "--progress", "jsn"], "did you mean 'json'?"),
+        (["run", "demo", "--budgt-usd", "3"], "did you mean --budget-usd?"),
+        (["run", "demo", "--progress", "jsn"], "did you mean json?"),
     ],
 )
 def test_a_misspelt_word_is_bad_usage_with_the_nearest_one(

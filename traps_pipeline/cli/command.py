@@ -91,7 +91,7 @@ class Parser(argparse.ArgumentParser):
             near = nearest(wrong[2], [*own, *self._short]) or nearest(wrong[2], last)
             name = f"{self.prog} {near}" if near in own else f"traps {last.get(near or '') or near}"
             name = f"traps {near}" if near in self._short else name
-            hint = f"; did you mean '{name}'?" if near else f"; `{self.prog} --help` lists them"
+            hint = f"; did you mean `{name}`?" if near else f"; `{self.prog} --help` lists them"
             message = f"unknown command {plain(wrong[2])[:40]!r}{hint}"
         elif wrong:
             message += did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3]))
