@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from tests.commands_page import PAGE, page
 from tests.conftest import ROOT
 from traps_pipeline.cli import GROUPS, build_parser, main
 from traps_pipeline.cli.command import SHORT
@@ -79,3 +80,9 @@ def test_a_shell_completes_commands_options_and_experiments(words: str, expected
     asked = f"COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _traps; echo ${{COMPREPLY[@]}}"
     done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True)
     assert (done.stdout.strip(), done.stderr) == (expected, "")
+
+
+def test_the_page_of_commands_is_what_the_parser_says_and_every_argument_has_a_meaning() -> None:
+    text = page()
+    assert PAGE.read_text(encoding="utf-8") == text  # `python -m tests.commands_page` writes it
+    assert not [line for line in text.splitlines() if line.startswith("| `") and line.split("|")[2].strip() == ""]

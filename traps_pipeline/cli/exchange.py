@@ -33,12 +33,12 @@ def add(commands: Commands) -> None:
     text = "import a provider's batch of votes into the ledger"
     parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl")
     add_experiment(parser)
-    parser.add_argument("file", type=Path)
+    parser.add_argument("file", type=Path, help="what came back")
 
     text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
     parser = commands.add("study import-answers", import_given, text, example="demo answers.jsonl --model oracle")
     add_experiment(parser)
-    parser.add_argument("file", type=Path)
+    parser.add_argument("file", type=Path, help="what came back")
     parser.add_argument("--model", help="who answered, in a file by item (default: the experiment's only model)")
     parser.add_argument("--run", type=whole(1, 1_000), default=1, help="of a file by item (default: 1)")
     parser.add_argument("--key", type=Path, help="of the held-out set whose items a file names")

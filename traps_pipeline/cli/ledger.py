@@ -16,7 +16,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="to be made")
     text = "read such a file into a study that has no answers yet: in its folder, or in the database of study.yaml"
     parser = commands.add("study import-ledger", import_, text, example="ledger.sqlite")
-    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("file", type=Path, metavar="FILE", help="of `traps study export-ledger`")
     text = "move the whole study into an object store that several hosts share"
     parser = commands.add("study move", move, text, example="--store s3://bucket/study")
     parser.add_argument("--store", metavar="ADDRESS", required=True, help="s3://BUCKET/STUDY")

@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
     """Add the commands of releases."""
     text = "write the folder that is published: clips, questions, labels, certificates, card, checksums"
     parser = commands.add("publish release", release, text, example="out --anonymous")
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="an empty or new one")
     parser.add_argument("--arms", nargs="+", default=[], metavar="ARM", help="also the items and clips of these arms")
     parser.add_argument("--anonymous", action="store_true", help="name no author, for double-blind review")
     parser.add_argument(
@@ -60,8 +60,8 @@ def add(commands: Commands) -> None:
     text = "prove that a revealed benchmark is the one that was committed"
     example = "commitment.json reveal.json --specs private"
     parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
-    parser.add_argument("commitment", type=Path)
-    parser.add_argument("reveal", type=Path)
+    parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
+    parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
     parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")

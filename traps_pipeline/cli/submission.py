@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
 
     text = "write the leaderboard as the hub's .eval_results, as Every Eval Ever JSON, and as Parquet"
     parser = commands.add("publish results", results, text, example="results --dataset owner/name")
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="where the files are written")
     parser.add_argument("--dataset", required=True, metavar="OWNER/NAME", help="repository of the release on the hub")
     parser.add_argument("--organization", default="unknown", help="who made the evaluation")
     parser.add_argument("--developer", default="unknown", help="of the models, as the hub names it")
