@@ -4,7 +4,8 @@
 
 Plain: one batch for each direction and dose, which shows the vision tower every clip again. Shipped: rows of all
 directions and doses share batches, and the vision tower sees each clip once (`models/local/vision_cache.py`). Answers
-must be equal, token by token. Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU they are seconds.
+must be equal, token by token. Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU
+they are seconds.
 
 Then the states of every clip under four prompts, as a study reads those of a control (two questions, two system
 prompts): each pass with its own vision pass, against passes that remember the clip. States must be equal, bit for bit.

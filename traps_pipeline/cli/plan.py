@@ -12,11 +12,13 @@ from traps_pipeline.base.terminal import text_table
 from traps_pipeline.cli.command import (
     OK,
     Commands,
+    add_experiment,
     add_panel,
     experiment_of,
     load_definitions,
     open_workspace,
     place_of,
+    print_json,
 )
 
 if TYPE_CHECKING:
@@ -27,9 +29,10 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add `traps plan`."""
-    parser = commands.add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent")
-    parser.add_argument("experiment")
-    parser.add_argument("--card", default="H100", help="GPU whose hours are told: H100 (default), A100, L40S, RTX4090")
+    text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
+    parser = commands.add("study plan", plan, text, example="demo", json=True)
+    add_experiment(parser)
+    parser.add_argument("--card", default="H100", help="GPU whose hours are given: H100 (default), A100, L40S, RTX4090")
     add_panel(parser)
 
 
@@ -48,6 +51,9 @@ def plan(arguments: argparse.Namespace) -> int:
     if arguments.card not in CARDS:
         raise TrapsError(f"--card {arguments.card}: name one of {', '.join(CARDS)}")
     planned = make_plan(workspace, experiment, study, arguments.card)
+    if arguments.json:
+        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
+        return OK
     total = (Count(), Count())
     print(f"{experiment.name} in {place if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
@@ -117,7 +123,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     print(f"\n{text_table(headings, rows)}")
     in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if in_batches < total[1]:
-        print(f"expected if all calls are made in batches (traps requests export --batch): USD {in_batches:,.2f}")
+        print(f"expected if all calls are made in batches (traps study export-requests --batch): USD {in_batches:,.2f}")
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(f"price unknown, not in the sum: {unknown}")

@@ -169,7 +169,6 @@ class DirectionRow(Extracted):
     draw: Draw
     layer: Layer
     n_pairs: Annotated[int, "pairs from which it was computed"]
-    n_steered: Annotated[int, "of these, pairs that are steered as well (0 if there are enough scenarios)"]
     norm: Annotated[float, "the class gap: length of mean(void) - mean(control)"]
     cosine: Annotated[float, "with the void direction of the same layer; 0 for a null, up to rounding"]
     residual_norm: Annotated[

@@ -89,6 +89,15 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
     return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES, gate])[:16]
 
 
+def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
+    """Digest of the inputs of sentences besides items and answers: those of states, the sentences, the prompt."""
+    settings = workspace.study.mechanism
+    if settings is None or extraction.model not in settings.models:
+        return "none"
+    prompt = system_prompt(extraction.prompt)
+    return digest([extraction_version(workspace, extraction), list(settings.sentences), prompt])[:16]
+
+
 def patching_version(workspace: Workspace, extraction: Extraction) -> str:
     """Digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
     settings = workspace.study.mechanism

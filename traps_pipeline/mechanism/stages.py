@@ -19,7 +19,6 @@ from traps_pipeline.mechanism.directions import (
     extract_directions,
     load_directions,
     save_directions,
-    steered_scenarios,
     vector_digest,
 )
 from traps_pipeline.mechanism.mechanism_rows import (
@@ -38,7 +37,7 @@ from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
-from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -231,8 +230,7 @@ def direction_pairs(
             "study.yaml: mechanism.steering is null, so the number of pairs for a direction is not known; set it there "
             "and in the experiment"
         )
-    most = steering.ill_posed_pairs if is_ill_posed(dataset) else steering.well_posed_pairs
-    chosen = direction_scenarios(sorted(set(items["scenario_id"])), most, settings.seed)
+    chosen = direction_scenarios(sorted(set(items["scenario_id"])), steering.direction_pairs(dataset), settings.seed)
     place = {
         (name, side): row for row, (name, side) in enumerate(zip(items["scenario_id"], items["side"], strict=True))
     }
@@ -245,8 +243,6 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     steering = settings.steering
     chosen, *sides = direction_pairs(settings, dataset, items)
     assert steering is not None, "direction_pairs refuses a study that steers nothing"
-    names = sorted(set(items["scenario_id"]))
-    steered = set(steered_scenarios(names, steering.pairs, settings.seed)) & set(chosen)
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
     voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
     seed = [settings.seed, DATASETS.index(dataset)]
@@ -275,7 +271,6 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
             draw=draw,
             layer=layer,
             n_pairs=len(chosen),
-            n_steered=len(steered),
             norm=float(directions.gaps[layer]),
             cosine=float(vectors[layer] @ directions.void[layer]),
             residual_norm=float(directions.residual_norms[layer]),

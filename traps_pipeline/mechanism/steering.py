@@ -110,7 +110,7 @@ def strengths(
                 f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
                 "there; name another layer in the experiment and in study.yaml"
             )
-        for unit, dose in row.doses:
+        for unit, dose in _within(row, of, layer, steering.cap):
             alpha = dose * float(of.gaps[layer]) if unit == "gap" else dose
             relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
@@ -121,8 +121,16 @@ def strengths(
 Dose = tuple[str, float]  # unit and number
 
 
+def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
+    """Return the doses of a direction without those in class gaps that are longer than `cap` control states; of a null
+    the largest one."""
+    longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
+    kept = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
+    return kept if row.kind == "void" else kept[-1:]
+
+
 class _Planned(NamedTuple):
-    """A direction along which a target is steered, with the sides and doses."""
+    """A direction along which a target is steered, with the sides and doses; a null is steered at the largest alone."""
 
     source: str
     kind: str
@@ -143,7 +151,7 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
     plan += [_Planned(target, "void", 0, at, signs, SIDES, doses) for signs in steering.signs]
     if steering.nulls:
         draws = product(steering.nulls.kinds, range(steering.nulls.draws))
-        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses[-1:]) for kind, draw in draws]
+        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses) for kind, draw in draws]
     sweep = [layer for layer in layers.sweep if layer != at]
     plan += [_Planned(target, "void", 0, layer, BY_LABEL, ("control",), alphas) for layer in sweep]
     return [row for row in plan if row.source in sources]
@@ -160,14 +168,18 @@ def count_answers(
     cells = set[tuple[Any, ...]]()
     for target, side in product(datasets, SIDES):
         owner = taxonomy_of(target) if side == "control" else target
-        cells.add((owner, side))
+        cells.add((owner, side, UNSTEERED))
         for row in _plan(target, settings.models[model], steering, datasets):
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
-                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, row.doses)}
+                doses = row.doses if row.kind == "void" else row.doses[-1:]
+                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, doses)}
     answers = Counter[str]()
     for cell in cells:
-        answers[cell[1]] += min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0))
+        source, taxonomy = str(cell[2]), taxonomy_of(str(cell[0]))
+        own = source != UNSTEERED and taxonomy_of(source) == taxonomy  # along a direction of its own scenarios
+        unseen = scenarios.get(taxonomy, 0) - (steering.direction_pairs(source) if own else 0)
+        answers[cell[1]] += max(0, min(steering.pairs, unseen))
     return dict.fromkeys(steering.inference_regimes, answers)
 
 
@@ -198,6 +210,7 @@ def wanted_steered(
         for item in rows
         for strength, sides in plan
         if item["side"] in sides
+        and (strength.source == UNSTEERED or item["scenario_id"] not in directions[strength.source].scenarios)
     ]
 
 

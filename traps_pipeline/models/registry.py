@@ -4,7 +4,6 @@ entry, no code. Judges (`assets/judges.yaml`) are entries of the same form."""
 from __future__ import annotations
 
 import datetime
-import difflib
 import os
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -19,6 +18,7 @@ from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
@@ -379,10 +379,8 @@ def get_model(model_id: str) -> ModelEntry:
     """The entry of that id. Raises TrapsError with ids that are like it."""
     models = load_models()
     if model_id not in models:
-        alike = difflib.get_close_matches(model_id, models, n=3, cutoff=0.4) or [*models][:3]
-        raise TrapsError(
-            f"unknown model {model_id!r:.60}; {MODELS_FILE} has {len(models)}, {', '.join(alike)} among them"
-        )
+        near = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
+        raise TrapsError(f"unknown model {model_id!r:.60}{near}")
     return models[model_id]
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.base.names import Name, check_name
+from traps_pipeline.protocol.datasets import is_ill_posed
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, VQA_PROMPTS
 from traps_pipeline.storage.media import MediaSpec
 
@@ -56,19 +57,30 @@ class SteeringSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(default=(2, 5, 10), min_length=1)
-    pairs: int = Field(default=50, ge=1, description="pairs a cell, the same scenarios for every cell of a taxonomy")
+    pairs: int = Field(
+        default=50, ge=1, description="pairs a cell; none is steered along a direction that comes from its scenario"
+    )
     well_posed_pairs: int = Field(default=100, ge=2, description="pairs that a well-posed direction comes from")
     ill_posed_pairs: int = Field(default=50, ge=2, description="pairs that an ill-posed direction comes from")
     direction_regimes: tuple[Regime, ...] = Field(default=(PROBE_PROMPT,), min_length=1)
     inference_regimes: tuple[Regime, ...] = Field(default=("guided",), min_length=1)
     gaps: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(
-        default=(1.0,), description="further doses, in units of the distance between the sides' means at the layer"
+        default=(0.5, 1, 2, 4), description="further doses, in units of the distance between the sides' means there"
+    )
+    cap: float = Field(
+        default=2.0,
+        gt=0,
+        description="longest dose in gaps, in mean lengths of control states; no longer one is given",
     )
     signs: tuple[Literal["plus", "minus"], ...] = Field(
         default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
     )
     nulls: NullSettings | None = NullSettings()
     max_new_tokens: int = Field(default=512, ge=1)
+
+    def direction_pairs(self, dataset: str) -> int:
+        """Return how many pairs the directions of a dataset come from at most."""
+        return self.ill_posed_pairs if is_ill_posed(dataset) else self.well_posed_pairs
 
     @field_validator("alphas", "gaps")
     @classmethod
@@ -111,6 +123,14 @@ class MechanismSettings(BaseModel):
     probes: ProbeSettings = ProbeSettings()
     gate: GateSettings = GateSettings()
     patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
+    sentences: tuple[str, ...] = Field(
+        default=(
+            "I don't know: this cannot be determined from the video.",
+            "I cannot tell from the video.",
+            "It is not possible to determine this from the video.",
+        ),
+        description="abstentions whose log-probability is read behind every item, a pass each; []: none",
+    )
     system: Literal["vqa", "benchmark"] = Field(
         default="vqa", description="system prompts of extraction: the short VQA ones, or the benchmark's own"
     )

@@ -201,14 +201,7 @@ class LocalModel:
 
     def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
         """The prompt with the first token of its greedy answer behind it."""
-        import torch
-
-        token = self.generate([prompt], 1, steering=steering)[0].tokens[0]
-        inputs = dict(prompt.inputs)
-        for name in prompt.sequences:
-            more = {"input_ids": token, "attention_mask": 1}.get(name, 0)  # else: of no modality
-            inputs[name] = torch.cat([inputs[name], inputs[name].new_full((1, 1), more)], dim=1)
-        return Prompt(prompt.text, inputs)
+        return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
     # --- answers ------------------------------------------------------------------------------------------------------
 
