@@ -134,7 +134,7 @@ def measure(spec: SceneSpec, folder: Path, whole: bool = False) -> Measured:
 
 
 def given(certificate: Certificate, spec: SceneSpec) -> bool:
-    """Whether the record's own evidence carries a certificate; `traps certify` measures that evidence again."""
+    """Whether the record's own evidence carries a certificate; `traps benchmark certify` measures it again."""
     return certificate.failure(stored_evidence(spec), Claim.of_record(spec)) is None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,9 +17,7 @@ from traps_pipeline.judging.robustness import check_panel, load_attacks
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.people.labels import LABELS_FILE, label_lines
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.servers.labelstore import DATABASE, LabelStore
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -92,30 +89,3 @@ def test_the_judges_that_failed_alone_are_asked_again(
         return check_panel(workspace, "one", panel, few)
 
     remedied(call, "judging.robustness", lambda: provider.configure(fault_by_model={}))
-
-
-# --- confabulation ----------------------------------------------------------------------------------------------------
-
-
-# --- people -----------------------------------------------------------------------------------------------------------
-
-
-def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_from_it(tmp_path: Path) -> None:
-    store = LabelStore(tmp_path)
-    for unit in ("u1", "u2"):
-        store.show("jd", "abstention", unit, "plinko-0001")
-        store.record("jd", "abstention", unit, {"abstained": True})
-    path, kept = tmp_path / LABELS_FILE, tmp_path / "copy"
-    shutil.copy(path, kept)
-    path.write_bytes(path.read_bytes().replace(b'"u1"', b'"u9"', 1))
-    lines = remedied(lambda: label_lines(tmp_path), "people.labels.label_lines", lambda: shutil.copy(kept, path))
-    assert [line.unit for line in lines] == ["u1", "u2"]
-    path.write_bytes(path.read_bytes() + b"nonsense\n")
-    remedied(lambda: LabelStore(tmp_path), "servers.labelstore", lambda: shutil.copy(kept, path))
-    for name in (f"{DATABASE}-wal", f"{DATABASE}-shm"):
-        (tmp_path / name).unlink(missing_ok=True)
-    (tmp_path / DATABASE).write_bytes(b"nonsense" * 1000)
-    again = remedied(
-        lambda: LabelStore(tmp_path), "servers.labelstore", lambda: (tmp_path / DATABASE).rename(tmp_path / "away")
-    )
-    assert again.labelled("jd", "abstention") == ["u1", "u2"]
