@@ -288,7 +288,7 @@ FIGURES: tuple[FigureReport, ...] = (
         "states_and_output",
         "States against output, item by item",
         expression_figures.states_and_output,
-        ("item_scores",),
+        ("item_scores", "sentences", "probe_baselines"),
         published=False,
         finding=findings.states_and_output,
     ),
