@@ -1,16 +1,14 @@
-"""A table is plain text in a pipe and styled on a terminal, and whole in both, however narrow."""
+"""A table is plain text in a pipe, whole however wide; on a terminal it is styled and fits."""
 
 from __future__ import annotations
 
 import os
-import pty
-import re
-import subprocess
 import sys
 
 import pytest
 
 from tests.conftest import ROOT
+from tests.terminals import run_in_terminal
 from traps_pipeline.base.terminal import text_table
 
 HEADINGS = ("model", "n", "what was refused")
@@ -42,30 +40,17 @@ def test_wide_characters_keep_the_columns_below_each_other() -> None:
     assert lines[1:] == ["日本  1", "abcd  2"]
 
 
-def test_a_terminal_gets_bold_headings_and_a_rule_and_every_cell_whole() -> None:
+@pytest.mark.parametrize("columns", [40, 400])
+def test_a_terminal_gets_headings_with_a_rule_and_the_columns_that_fit(columns: int) -> None:
     code = f"from traps_pipeline.base.terminal import text_table; print(text_table({HEADINGS!r}, {ROWS!r}, (0, 2)))"
-    ours, theirs = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "40"}
-    environment.pop("NO_COLOR", None)
-    command = [sys.executable, "-c", code]
-    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=theirs) as process:
-        os.close(theirs)
-        shown = b""
-        while chunk := _read(ours):
-            shown += chunk
-    os.close(ours)
-    assert process.returncode == 0
-    text = shown.decode().replace("\r\n", "\n")
-    assert "\x1b[1m" in text.splitlines()[0]
-    lines = re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines()
-    assert lines[0].split() == " ".join(HEADINGS).split()
-    assert set(lines[1]) == {"─"}
-    assert lines[3].endswith(REFUSED)
-
-
-def _read(terminal: int) -> bytes:
-    """What a process has written to its terminal; empty at its end, of which Linux tells by an error."""
-    try:
-        return os.read(terminal, 65536)
-    except OSError:
-        return b""
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "NO_COLOR")}
+    returned, screen = run_in_terminal([sys.executable, "-c", code], columns, 24, ROOT, environment)
+    assert returned == 0
+    lines = screen.text.splitlines()
+    assert set(lines[1].rstrip()) == {"─"}
+    if columns == 40:
+        assert lines[0].split() == ["model", "n"] and lines[3].split() == ["a-model-of-a-long-name", "1234"]
+        assert lines[4:] == ["not shown in 40 columns: what was refused"]
+    else:
+        assert lines[0].split() == " ".join(HEADINGS).split()
+        assert lines[3].endswith(REFUSED)

@@ -9,6 +9,8 @@ import pytest
 from tests.build.live import NAME, Check, check
 from tests.conftest import KEY
 from tests.providers.server import Provider
+from tests.providers.servers import closed_port
+from traps_pipeline.base import progress
 from traps_pipeline.models.judges import JudgeEntry
 
 __all__ = ["check"]  # fixtures
@@ -49,7 +51,29 @@ def test_a_name_that_a_list_lacks_is_a_note_where_it_answers(check: Check, provi
 def test_a_server_that_breaks_is_told_from_one_that_refuses(check: Check, provider: Provider) -> None:
     provider.configure(fault_by_model={NAME: "server_error"})
     assert {problem.partition(":")[0] for problem in check().problems} == {"clip", "no clip"}
-    assert all("an error of its own (HTTP 5xx)" in problem for problem in check().problems)
+    assert all("ends in an error of its own" in problem for problem in check().problems)
+
+
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [(429, "takes no call now; what it said stands above: wait, or raise"), (502, "ends in an error")],
+)
+def test_an_error_in_a_200_is_named_as_one(
+    check: Check, provider: Provider, capsys: pytest.CaptureFixture[str], code: int, cause: str
+) -> None:
+    provider.configure(raw_by_model={NAME: {"content": f'{{"error": {{"message": "busy", "code": {code}}}}}'}})
+    with progress.reporting(progress.Progress()):
+        assert all(cause in problem for problem in check().problems)
+    assert "busy (an error object in an HTTP 200)" in capsys.readouterr().err
+
+
+def test_a_proxy_that_is_dead_is_named_and_no_server_is_said_to_be_down(
+    check: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HTTPS_PROXY", f"http://127.0.0.1:{closed_port()}")
+    (problem,) = check(address="https://provider.invalid/v1").problems
+    assert "of HTTPS_PROXY: Connection refused" in problem
+    assert "look at this machine's network and proxy variables" in problem
 
 
 def test_a_key_that_is_not_set_is_a_finding_and_no_end(check: Check) -> None:

@@ -1,79 +1,144 @@
-"""Progress on a terminal: one line a partition, with calls, cache hits and the time left."""
+"""Progress of a run: lines for a log, lines of JSON for a program, a live region for a person at a terminal."""
 
 from __future__ import annotations
 
 import io
+import json
+import os
 import time
 
 import pytest
 
-from traps_pipeline.base.progress import Tally
-from traps_pipeline.cli.progress import LIVE_SECONDS, TerminalProgress
+from tests.terminals import Screen, read_all, terminal
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally
+from traps_pipeline.cli.progress import LiveProgress, make_progress
+
+WORDS = "a provider's words that are longer than the eighty columns of a terminal, so that they stand on two lines"
 
 
-def test_each_partition_is_a_line_with_its_counts_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+class Clock:
+    """The seconds that the package's clock shows."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def ask(report: Progress, clock: Clock) -> None:
+    """Ask a model for forty seconds: two of four cells, a call each second, the fifth of which fails."""
+    report.money(1.0, 50.0)
+    report.stage("responses", 4)
+    for cell in range(2):
+        report.asking("responses", {"gpt": (20, 7)})
+        for _ in range(20):
+            clock.now += 1.0
+            report.called("gpt", clock.now == 5, latency_s=clock.now / 10, dollars=0.25)
+        if cell == 0:
+            report.partition("responses", "a", Tally(asked=20, cached=7, errors=1))
+    report.retried("gpt")
+
+
+def test_a_line_has_pace_latency_failures_money_and_time_left(clock: Clock) -> None:
+    report = Progress()
+    ask(report, clock)
+    # 40 calls in 40 s, whose median took 2.1 s; all calls of 2 of 4 cells are made, so as long again is left
+    line = "responses: 1 of 4, 1.0/s at 2.1 s, 1 errors, 1 retries, $11.00 of $50.00, 0:40 left"
+    assert report.line() == line
+
+
+def test_time_left_counts_calls_of_cells_that_are_begun(clock: Clock) -> None:
+    stage = StageProgress("votes", 10)
+    report = Progress()
+    report.current_stage = stage
+    assert stage.left_s is None
+    report.asking("votes", {"judge": (10, 0)})
+    clock.now = 30.0
+    for _ in range(5):
+        report.called("judge", False, 0.1, 0.0)
+    assert stage.left_s == pytest.approx(570.0)  # half a cell of ten in 30 s
+
+
+def test_a_listener_hears_of_a_stage_every_half_minute_and_at_its_end(clock: Clock) -> None:
+    report, lines = Progress(), list[str]()
+    with report.heard_by(lines.append):
+        report.stage("videos", 1)
+        for second in range(100):
+            clock.now = float(second)
+            report.tick("videos", "scenarios", second, 100)
+        report.partition("videos", "plinko", Tally(frames=50))
+        report.end_stage()
+    assert [line.split(": ")[2].split(",")[0] for line in lines[:3]] == ["30 of 100", "60 of 100", "90 of 100"]
+    assert lines[3:] == ["videos: 1 of 1 made, 50 frames, 1:39"]
+    assert HEARTBEAT_S == 30
+
+
+def test_a_log_has_a_line_for_each_stage_that_worked_and_one_for_all_tables(clock: Clock) -> None:
     out = io.StringIO()
-    live = TerminalProgress(out)
-    live.stage("responses", 4)
-    now[0] = 30.0
-    live.partition("responses", "chaotic|oracle__json__run1", Tally(asked=10, cached=6))
-    now[0] = 60.0
-    live.partition("responses", "chaotic|prior__json__run1", Tally(cached=16))
-    live.partition("leaderboard", "", Tally())
-    first, second, third, fourth = out.getvalue().splitlines()
-    assert first == "responses: 4 partitions to do"
-    said = [" ".join(line.split()) for line in (second, third, fourth)]
-    assert said == [
-        "responses chaotic|oracle__json__run1 10 asked, 6 cached [1/4] 1:30 left",
-        "responses chaotic|prior__json__run1 16 cached [2/4] 1:00 left",
-        "leaderboard - done [3/4] 0:20 left",
+    report = make_progress("auto", out)
+    ask(report, clock)
+    for name in ("verdicts", "metrics", "figure_patching"):
+        report.stage(name, 2)
+        clock.now += 3.0
+        report.partition(name, "a", Tally())
+        report.partition(name, "b", Tally(), is_empty=name == "figure_patching")
+    report.note("something\x1b[2J odd")
+    report.close()
+    assert out.getvalue().splitlines() == [
+        "responses: 1 of 4 made, 20 asked, 7 from the ledger, 1 failed, 1 retried, $10.00, 0:40",
+        "! something?[2J odd",
+        "5 tables and figures, 9 s",
     ]
-    assert live.totals == {"responses": Tally(asked=10, cached=22), "leaderboard": Tally()}
+    assert report.totals["responses"] == Tally(asked=20, cached=7, errors=1)
 
 
-def test_a_long_partition_speaks_every_half_minute_and_no_oftener(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     out = io.StringIO()
-    live = TerminalProgress(out)
-    for second in range(100):
-        now[0] = float(second)
-        live.tick("responses", "a cell", second, 100)
-    lines = out.getvalue().splitlines()
-    assert [line.split(": ")[1] for line in lines] == ["30 of 100", "60 of 100", "90 of 100"]
-    assert LIVE_SECONDS == 30
+    report = make_progress("json", out)
+    ask(report, clock)
+    report.beat()
+    report.note("slow")
+    report.close()
+    begin, progress, note, end = map(json.loads, out.getvalue().splitlines())
+    assert (begin["event"], begin["stage"], begin["done"], begin["partitions"]) == ("begin", "responses", 0, 4)
+    assert (progress["event"], progress["spent_usd"], progress["budget_usd"]) == ("progress", 11.0, 50.0)
+    assert progress["left_s"] == 40.0
+    gpt = {"done": 40, "wanted": 40, "cached": 14, "errors": 1, "retries": 1}
+    assert progress["calls"] == {"gpt": gpt | {"per_second": 1.0, "p50_s": 2.1, "p95_s": 3.9, "usd": 10.0}}
+    assert (note["event"], note["text"]) == ("note", "slow")
+    assert (end["event"], end["asked"], end["errors"]) == ("end", 20, 1)
 
 
-def test_calls_are_told_every_half_minute_with_pace_latency_money_and_time_left(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("columns", "rows"), [(80, 24), (160, 50)])
+def test_a_terminal_has_one_region_at_its_bottom_that_leaves_nothing_behind(
+    columns: int, rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    out = io.StringIO()
-    live = TerminalProgress(out)
-    live.asking("responses", "gpt", wanted=100, cached=7)
-    for second in range(1, 41):
-        now[0] = float(second)
-        live.called("responses", "gpt", failed=second == 5, latency_s=second / 10, dollars=0.25)
-    (line,) = out.getvalue().splitlines()  # at 30 s
-    said = " ".join(line.split())
-    # p50 and p95 of 0.1 .. 3.0 s; 70 of 100 are left at one a second
-    assert said == ("responses gpt: 30 of 100, 7 cached, 1 errors, 1.0/s, p50 1.6 s, p95 2.9 s, $7.50, 1:10 left")
-
-
-def test_a_terminal_shows_who_is_asked_as_a_live_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    out = io.StringIO()
-    monkeypatch.setattr(out, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    live = TerminalProgress(out)
-    live.asking("responses", "gpt", wanted=10, cached=0)
-    for second in range(1, 6):
-        now[0] = float(second)
-        live.called("responses", "gpt", failed=False, latency_s=0.5, dollars=0.0)
-    live.close()
-    shown = out.getvalue()
-    assert "gpt" in shown and "5 of 10" in shown and "p95" in shown
+    for name, value in {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": str(rows)}.items():
+        monkeypatch.setenv(name, value)
+    screen = Screen(columns)
+    with terminal(columns, rows) as (ours, theirs), os.fdopen(os.dup(theirs), "w") as stream:
+        report = make_progress("auto", stream)
+        assert isinstance(report, LiveProgress)
+        report.money(1234.5, 5000.0)
+        report.stage("confabulation_votes", 32)
+        report.asking("responses", {f"a-model-with-a-rather-long-name-{n}": (12345, 0) for n in range(30)})
+        report.called("a-model-with-a-rather-long-name-7", True, 12.3, 1000.0)
+        report.note(WORDS)
+        report._live.refresh()
+        screen.feed(read_all(ours))
+        report.partition("confabulation_votes", "a", Tally(asked=1))
+        report.close()
+        screen.feed(read_all(ours))
+    shown = [line for line in screen.frames[0] if line]
+    note = shown.index(next(line for line in shown if line.startswith("! a provider")))
+    assert "$2,234.50 of $5,000.00" in shown[note + (2 if columns == 80 else 1)]
+    row = next(line for line in shown if "12.3 s" in line)
+    assert row.split()[1:] == ["1/12,345", *row.split()[2:]] and "$1,000.00" in row
+    assert len(shown) < rows and shown[-1].strip().startswith("and ")
+    assert screen.widest <= columns
+    assert screen.text.splitlines()[-1].startswith("confabulation_votes: 1 of 32 made, 1 asked")
+    assert "p95" not in screen.text  # the region is gone

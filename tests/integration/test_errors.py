@@ -96,7 +96,7 @@ def test_a_damaged_row_of_the_ledger_is_named_and_its_answer_alone_asked_again(s
         table.unlink()
     finished = study.score(EXPERIMENT)
     assert finished.code == 0, finished.err
-    assert f"{path}: row {row}: not what was written: it is not believed; its answer is asked again" in finished.out
+    assert f"{path}: row {row}: not what was written: it is not believed; its answer is asked again" in finished.err
     assert finished.counts()["answers"] == 1
 
 

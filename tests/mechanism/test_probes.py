@@ -204,7 +204,7 @@ def test_a_planted_signal_is_found_at_its_layer_and_nowhere_else(rows: pd.DataFr
     assert (best["low"] <= best["value"]).all() and (best["value"] <= best["high"]).all()
     elsewhere = transfer[transfer["layer"] != PLANTED].groupby("layer")["value"].mean()
     assert (elsewhere - 0.5).abs().max() < 0.12  # twelve paths of 24 items: standard error 0.035
-    chosen = transfer[transfer["source_best"]]
+    chosen = transfer[transfer["chosen"]]
     assert chosen["layer"].tolist() == [PLANTED] * 12
 
 
@@ -266,7 +266,7 @@ def test_a_target_label_never_influences_a_fit() -> None:
     assert np.allclose(of_target["value"] + of_target["value_after"], 1, atol=1e-12)
     others = both[(both["target"] != "chaotic") & (both["source"] != "chaotic")]
     assert len(others) == 6 * LAYERS and (others["value"] == others["value_after"]).all()
-    assert (of_target["source_best"] == of_target["source_best_after"]).all()  # the source's choice saw no target label
+    assert (of_target["chosen"] == of_target["chosen_after"]).all()  # the source's choice saw no target label
 
 
 def test_shared_controls_flatter_pairs_of_one_taxonomy_unless_their_scenario_is_held_out() -> None:

@@ -94,8 +94,8 @@ def test_published_rows_without_a_figure_are_left_out_and_not_invented() -> None
     assert cosines["qwen3-vl-8b", "occlusion", "chaotic"] == -0.05
     assert cosines["gemma-4-e4b", "chaotic_ill_posed", "chaotic"] == 0.55
     assert ("llava-next-video-7b", "chaotic", "occlusion") not in cosines.index
-    answerable = next(t for t in probe_tables.probes(PAPER) if t.name == "probe_answerable")
-    assert answerable.absence == "not run: the paper has no such control"
+    layers = next(t for t in probe_tables.probes(PAPER) if t.name == "probe_layers")
+    assert layers.absence == "not run: the paper prints no curves"
     assert set(PAPER.effects["directions"]) == {"standard"} and set(PAPER.effects["regime"]) == {"guided"}
 
 

@@ -112,7 +112,7 @@ def test_what_may_pass_is_worth_another_try(provider: Provider, route: str, faul
         ask(provider, route)
     assert kind in (None, raised.value.kind)
     assert raised.value.retry_after_s == (7.0 if fault == "rate_limited" else None)
-    assert raised.value.billed == (fault not in ("rate_limited", "rate_limited_bare", "overloaded", "conflict"))
+    assert raised.value.billed == (fault in ("timeout_status", "hang", "cut", "wrong_content_type"))
     assert provider.stats()["requests"] == 1  # no layer below retries
 
 

@@ -100,19 +100,24 @@ ODD = {
     "byte-order-mark": "\ufeff\ufeff" + body(),
     "deep": "[" * 100_000,
     "many-digits": usage(completion_tokens=21).replace("21", "9" * 5000),
-    "error-in-200": json.dumps({"error": {"message": "upstream failed", "code": 502}}),
+    "given-up-in-200": json.dumps({"error": {"message": "upstream took too long", "code": 504}}),
+    "error-in-choice": body(choices=[CHOICE | {"error": {"message": "upstream failed", "code": 502}}]),
     "cost-by-name": body(usage={"cost_usd": -1000}),
     "model-and-no-usage": body(model=5, usage=None),
 }
 STATUSES = {f"status-{status}": status for status in (500, 502, 504, 520, 522, 524, 599, 408, 302, 307, 204)}
 UNBILLED = {f"status-{status}": status for status in (400, 401, 403, 404, 409, 422, 429, 503)}
+EXPLAINED = {f"explained-{status}": status for status in (500, 502, 520)}  # with an error object of the provider's
 REFUSED_IN_200 = {  # by what a provider says in a 200, and what it amounts to
     "number": ({"code": 429, "message": "slow down"}, "rate_limited"),
     "word": ({"code": "rate_limit_exceeded", "message": "slow down"}, "rate_limited"),
     "anthropic": ({"type": "overloaded_error", "message": "Overloaded"}, "server_error"),
     "gemini": ({"code": 403, "status": "PERMISSION_DENIED", "message": "no permission"}, "http_403"),
+    "upstream": ({"code": 502, "message": "Provider returned error"}, "server_error"),
+    "unnamed": ({"message": "something went wrong"}, "server_error"),
     "final": ({"code": "404", "message": "no such model"}, "http_404"),
 }
+FAILED = json.dumps({"error": {"message": "The server had an error", "type": "server_error"}})
 FLAT_IN_200 = {"code": 429, "message": "slow down", "request_id": "r"}  # an error object that is the whole body
 
 
@@ -124,6 +129,8 @@ def odd(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
     raw["event-stream"]["type"] = "text/event-stream"
     raw["in-200-flat"] = {"content": json.dumps(FLAT_IN_200), "billed": False}
     raw |= {name: {"content": body(), "status": status} for name, status in (STATUSES | UNBILLED).items()}
+    explained = {"content": FAILED, "billed": False}
+    raw |= {name: explained | {"status": status} for name, status in EXPLAINED.items()}
     for name, (error, _) in REFUSED_IN_200.items():
         raw[f"in-200-{name}"] = {"content": json.dumps({"error": error}), "billed": False}
     return shared_provider.afresh(raw_by_model=raw, usd_a_token=USD_A_TOKEN)
@@ -159,8 +166,8 @@ def test_what_a_provider_bills_for_an_odd_answer_is_booked(odd: Provider, shape:
     assert outcome.text in (None, ANSWER)
 
 
-@pytest.mark.parametrize("shape", UNBILLED)
-def test_a_call_that_a_provider_did_not_take_costs_nothing(odd: Provider, shape: str) -> None:
+@pytest.mark.parametrize("shape", [*UNBILLED, *EXPLAINED])
+def test_a_call_that_a_provider_did_not_take_or_reports_as_failed_costs_nothing(odd: Provider, shape: str) -> None:
     outcome, booked_usd = booked_for(odd, shape)
     assert outcome and booked_usd == odd.stats()["billed_usd"] == 0.0
 
@@ -218,17 +225,12 @@ def test_a_usage_that_contradicts_itself_is_booked_at_its_largest_and_said(
 
 
 @pytest.mark.parametrize("finish", ["error", "abort", "insufficient_system_resource"])
-def test_half_an_answer_is_asked_again_and_never_one(odd: Provider, finish: str) -> None:
+def test_half_an_answer_is_asked_again_and_costs_what_its_usage_says(odd: Provider, finish: str) -> None:
     odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": finish}])}})
     outcome, booked_usd = booked_for(odd, "m")
     assert outcome and (outcome.kind, outcome.error, outcome.text) == ("error", f"ended_{finish}", None)
-    assert odd.stats()["requests"] == 2 and booked_usd >= odd.stats()["billed_usd"]
-
-
-def test_half_an_answer_costs_what_its_usage_says(odd: Provider) -> None:
-    odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": "abort"}])}})
-    outcome, booked_usd = booked_for(odd, "m")
-    assert outcome and booked_usd == outcome.cost_usd == pytest.approx(2 * (20e-6 + 21e-5))  # two tries
+    assert odd.stats()["requests"] == 2
+    assert booked_usd == outcome.cost_usd == pytest.approx(2 * (20e-6 + 21e-5))
 
 
 def test_an_unknown_finish_reason_is_kept_with_its_text_and_is_no_answer(odd: Provider) -> None:

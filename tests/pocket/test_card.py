@@ -90,7 +90,7 @@ def examined_study(root: Path, seed: int, area: float, share: float) -> Workspac
     common = {**extraction, "scope": "all", "source": "occlusion", "target": "chaotic"}
     probes = [
         filled(PROBES, **common, analysis="transfer", layer=layer, value=value, own_best=layer == 2,
-               source_best=layer == 1)
+               chosen=layer == 1)
         for layer, value in ((1, area - 0.1), (2, area))
     ]  # fmt: skip
     workspace.tables.write(PROBES, extraction, probes, {})

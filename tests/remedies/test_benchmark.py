@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,9 @@ import pytest
 
 from tests.build.frames import frames
 from tests.remedies.remedied import remedied
-from traps_pipeline.benchmark.corrections import Correction, check_benchmark, fold, read_corrections
-from traps_pipeline.benchmark.held_out import held_out_key
+from traps_pipeline.benchmark.corrections import fold, read_corrections
 from traps_pipeline.benchmark.records import RELEASED, load_released
 from traps_pipeline.scenes.worlds.spec import load_trajectory
-from traps_pipeline.storage.study import Study
 from traps_pipeline.video.encode import DamagedClip, decode, encode
 
 ID, OTHER = "domino_chain-0001", "plinko-0003"
@@ -57,12 +54,8 @@ OTHER_LABEL = next(label for label in RECORDS[ID].labels if label != RECORDS[ID]
             "benchmark.corrections.fold",
             correction("keep", "domino_chain-0001"),
         ),
-        (
-            correction(),
-            "benchmark.corrections._corrected",
-            correction(params={"azimuth_deg": 5.0}),
-        ),
-        (correction(), "benchmark.corrections._corrected", correction("keep")),
+        (correction(), "benchmark.corrections", correction(params={"azimuth_deg": 5.0})),
+        (correction(), "benchmark.corrections", correction("keep")),
     ],
 )
 def test_a_decision_that_is_corrected_as_told_is_folded(
@@ -71,9 +64,7 @@ def test_a_decision_that_is_corrected_as_told_is_folded(
     path = tmp_path / "review.jsonl"
     write(path, correction("keep", OTHER), wrong)()
     scenarios = remedied(
-        lambda: fold(RECORDS, read_corrections(tmp_path)),
-        by,
-        write(path, correction("keep", OTHER), right),
+        lambda: fold(RECORDS, read_corrections(tmp_path)), by, write(path, correction("keep", OTHER), right)
     )
     assert set(RECORDS) <= set(scenarios)
 
@@ -123,34 +114,6 @@ def test_a_trajectory_is_read_once_it_is_restored(tmp_path: Path, damage: Callab
     assert len(qpos) > 1
 
 
-def test_records_of_another_benchmark_are_used_once_the_experiment_names_them(tmp_path: Path) -> None:
-    remedied(
-        lambda: check_benchmark(Study(benchmark="mine")),
-        "benchmark.corrections.check_benchmark",
-        again=lambda: check_benchmark(Study(benchmark="released")),
-    )
-
-
-def decision(action: str, **changes: Any) -> Correction:
-    about = {"who": "jd", "when": date(2026, 11, 21), "why": "looked at it"}
-    return Correction.model_validate({"scenario_id": ID, "action": action, **changes, **about})
-
-
-@pytest.mark.parametrize(
-    ("content", "by"),
-    [
-        (None, "benchmark.held_out.held_out_key"),
-        ("no key", "benchmark.held_out.held_out_key"),
-    ],
-)
-def test_the_key_that_the_release_made_is_read(tmp_path: Path, content: str | None, by: str) -> None:
-    right, wrong = tmp_path / "key", tmp_path / "other"
-    made = held_out_key(right, make=True)
-    if content is not None:
-        wrong.write_text(content)
-    assert remedied(lambda: held_out_key(wrong), by, again=lambda: held_out_key(right)) == made
-
-
 # --- clips and items --------------------------------------------------------------------------------------------------
 
 
@@ -166,10 +129,5 @@ def test_a_clip_that_holds_fewer_frames_than_it_promises_is_made_again(tmp_path:
         encode(frames(3), clip, 10)
 
     clip.write_bytes(data[:-last])
-    decoded, _ = remedied(
-        lambda: decode(clip),
-        "video.encode.decode",
-        made_again,
-        error=DamagedClip,
-    )
+    decoded, _ = remedied(lambda: decode(clip), "video.encode.decode", made_again, error=DamagedClip)
     assert len(decoded) == 3

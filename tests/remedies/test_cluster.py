@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import secrets
 import signal
@@ -18,12 +19,13 @@ from tests.conftest import ROOT, Checkout, make_checkout
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
-from tests.remedies.test_money import paid
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
 from traps_pipeline.cluster.history import HISTORY, LOGS
 from traps_pipeline.cluster.ray_runs import require_cluster
 from traps_pipeline.cluster.same_code import code_here, require_same_code
+from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.spending import spending
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
@@ -49,12 +51,12 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
 ) -> None:
     s3.empty()
     content = b"frames"
-    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket.Bucket._used", s3.make_bucket)
+    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket", s3.make_bucket)
     assert Bucket(address).get("a") == content
     monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
     found = remedied(
         lambda: Bucket(address).get("a"),
-        "cluster.bucket.Bucket._used",
+        "cluster.bucket",
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
@@ -88,28 +90,18 @@ def test_a_store_of_google_or_azure_without_its_key_is_refused_with_the_variable
         Bucket(address).get("a")
 
 
-def test_a_store_of_azure_is_opened_once_its_account_and_key_are_exported(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("obstore", reason="obstore is not installed; `pip install -e '.[dev]'` brings it")
-    monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
-
-    def export() -> None:
-        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "lab")
-        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", "a2V5")
-
-    opened = remedied(lambda: Bucket("az://lab/study"), "cluster.bucket.Bucket.__init__", export)
-    assert opened.address == "az://lab/study"
-
-
 def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(address: str, tmp_path: Path) -> None:
     shared = tmp_path / "openai"
     shared.mkdir()
     (shared / "budget.yaml").write_text("usd: 100")
     workspace = Workspace.create(address, Study(budget_usd=50, account_budgets={"openai": "openai"}))
-    remedied(
-        paid(address),
-        "models.spending.account_budgets",
-        lambda: workspace.allow(account_budgets={"openai": str(shared)}),
-    )
+    entry = get_model("gpt-5-mini")
+
+    def pay() -> None:
+        with spending(Workspace.open(address), [entry]) as budget:
+            asyncio.run(budget.reserve(entry.id, 2.0))
+
+    remedied(pay, "models.spending.account_budgets", lambda: workspace.allow(account_budgets={"openai": str(shared)}))
 
 
 # --- runs on other hosts ----------------------------------------------------------------------------------------------
@@ -126,7 +118,7 @@ def head(workspace: Workspace) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "traps_pipeline.cli", "ui", "--port", str(20_000 + secrets.randbelow(10_000))]
     process = subprocess.Popen(
         command, cwd=ROOT, env=os.environ | own, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        start_new_session=True,
+        start_new_session=True
     )  # fmt: skip
     try:
         yield process
@@ -189,9 +181,7 @@ def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -
     ours = file.read_text()
     file.write_text(ours + "# altered on that host\n")
     remedied(
-        lambda: require_same_code(code(), "lab"),
-        "cluster.same_code.require_same_code",
-        lambda: file.write_text(ours),
+        lambda: require_same_code(code(), "lab"), "cluster.same_code.require_same_code", lambda: file.write_text(ours)
     )
     assert code() == code_here()
 

@@ -77,7 +77,7 @@ def test_verdicts_are_made_once_all_votes_are_there(tmp_path: Path) -> None:
         ]
         return decide(items, answers, workspace.tables.read(VOTES, CELL.partition))
 
-    assert len(remedied(verdicts, "judging.verdicts._refuse", voted)) == 4
+    assert len(remedied(verdicts, "judging.verdicts", voted)) == 4
 
 
 @pytest.mark.slow  # asks a server
@@ -93,11 +93,7 @@ def test_the_judges_that_failed_alone_are_asked_again(
     def call() -> object:
         return check_panel(workspace, "one", panel, few)
 
-    remedied(
-        call,
-        "judging.robustness.check_panel.<locals>.finish",
-        lambda: provider.configure(fault_by_model={}),
-    )
+    remedied(call, "judging.robustness", lambda: provider.configure(fault_by_model={}))
 
 
 # --- confabulation ----------------------------------------------------------------------------------------------------
@@ -121,18 +117,12 @@ def test_a_sheet_is_written_once_there_are_labels_of_these_answers(tmp_path: Pat
         again=lambda: command("confabulation", "sheet", tmp_path / "other.csv", *at),
     )
     remedied(
-        lambda: write_sheet(annotation_sheet(workspace), sheet),
-        "people.judge_validation.write_sheet",
-        sheet.unlink,
+        lambda: write_sheet(annotation_sheet(workspace), sheet), "people.judge_validation.write_sheet", sheet.unlink
     )
     cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
     answers = workspace.tables.read(RESPONSES, cell.partition)
     workspace.tables.write(RESPONSES, cell.partition, answers.assign(text="Right."), {})
-    remedied(
-        lambda: annotation_sheet(workspace),
-        "people.judge_validation._sheet_row",
-        lambda: labelled_study(root, ["Right."]),
-    )
+    remedied(lambda: annotation_sheet(workspace), "people.judge_validation", lambda: labelled_study(root, ["Right."]))
 
 
 def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: Path) -> None:
@@ -141,7 +131,7 @@ def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: 
         written(tmp_path, HEAD, *GOOD[:3], "bob,s2,1,0,2,1")
         remedied(
             lambda: read_labels(path, ["s1", "s2"]),
-            "people.judge_validation._refuse",
+            "people.judge_validation",
             lambda right=right: written(tmp_path, HEAD, *GOOD[:3], f"bob,s2,1,0,{right},1"),
         )
     workspace = labelled_study(tmp_path / "study", ["It goes left."])
@@ -167,24 +157,14 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     path, kept = tmp_path / LABELS_FILE, tmp_path / "copy"
     shutil.copy(path, kept)
     path.write_bytes(path.read_bytes().replace(b'"u1"', b'"u9"', 1))
-    lines = remedied(
-        lambda: label_lines(tmp_path),
-        "people.labels.label_lines",
-        lambda: shutil.copy(kept, path),
-    )
+    lines = remedied(lambda: label_lines(tmp_path), "people.labels.label_lines", lambda: shutil.copy(kept, path))
     assert [line.unit for line in lines] == ["u1", "u2"]
     path.write_bytes(path.read_bytes() + b"nonsense\n")
-    remedied(
-        lambda: LabelStore(tmp_path),
-        "servers.labelstore._last_seq",
-        lambda: shutil.copy(kept, path),
-    )
+    remedied(lambda: LabelStore(tmp_path), "servers.labelstore", lambda: shutil.copy(kept, path))
     for name in (f"{DATABASE}-wal", f"{DATABASE}-shm"):
         (tmp_path / name).unlink(missing_ok=True)
     (tmp_path / DATABASE).write_bytes(b"nonsense" * 1000)
     again = remedied(
-        lambda: LabelStore(tmp_path),
-        "servers.labelstore.LabelStore._database",
-        lambda: (tmp_path / DATABASE).rename(tmp_path / "away"),
+        lambda: LabelStore(tmp_path), "servers.labelstore", lambda: (tmp_path / DATABASE).rename(tmp_path / "away")
     )
     assert again.labelled("jd", "abstention") == ["u1", "u2"]

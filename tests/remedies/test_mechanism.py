@@ -11,18 +11,12 @@ import pytest
 
 from tests.build.directions import origin, pair_states
 from tests.build.mechanism import STANDARD, entry, own, patch, study
-from tests.mechanism.study import PAIRS, SETTINGS, write_verdicts
 from tests.remedies.remedied import remedied
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.directions import extract_directions, load_directions, save_directions
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.mechanism.patched import patching_rows
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.models.local.adapter import load_local_model
-from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import StatesCell
-from traps_pipeline.storage.study import Asked, MechanismSettings, PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -66,11 +60,7 @@ def test_directions_of_more_scenarios_are_made_and_damaged_files_are_written_aga
     save_file({"void": load_file(path)["void"]}, path)
     note = json.loads(path.with_suffix(".json").read_text())
     path.with_suffix(".json").write_text(json.dumps(note | {"tensors_sha256": file_digest(path)}))
-    remedied(
-        lambda: load_directions(path),
-        "mechanism.directions.load_directions",
-        made_again,
-    )
+    remedied(lambda: load_directions(path), "mechanism.directions.load_directions", made_again)
 
 
 # --- stages -----------------------------------------------------------------------------------------------------------
@@ -83,7 +73,7 @@ def test_states_that_are_missing_or_damaged_are_extracted_again(own: Workspace) 
         return StoredStates.of(own, STANDARD).read("chaotic", 2)
 
     shutil.rmtree(folder)
-    remedied(read, "mechanism.hidden_states._ids", extracted(own))
+    remedied(read, "mechanism.hidden_states", extracted(own))
     shard = next(folder.glob("shard-*.safetensors"))
     shard.write_bytes(shard.read_bytes()[:100])
 
@@ -91,57 +81,7 @@ def test_states_that_are_missing_or_damaged_are_extracted_again(own: Workspace) 
         shard.unlink()
         extracted(own)()
 
-    remedied(read, "mechanism.hidden_states._tensor", deleted_and_run)
+    remedied(read, "mechanism.hidden_states", deleted_and_run)
     rows = own.tables.read(HIDDEN_STATES, CHAOTIC.partition)
     own.tables.write(HIDDEN_STATES, CHAOTIC.partition, rows.assign(states_key="another"), {})
     remedied(read, "mechanism.stored.StoredStates.read", extracted(own))
-
-
-def test_a_model_and_its_layers_are_read_once_the_study_names_them(own: Workspace) -> None:
-    settings = own.mechanism
-    own.allow(
-        mechanism=MechanismSettings.model_validate(SETTINGS | {"models": {"tiny": {"steering": 9, "centroid": 1}}})
-    )
-    remedied(
-        lambda: stages.extract_states(Workspace.open(own.root), CHAOTIC),
-        "mechanism.stages._check_layers",
-        lambda: own.allow(mechanism=settings),
-    )
-    remedied(
-        lambda: stages.examined_model(Workspace.open(own.root), "qwen3-vl-8b"),
-        "mechanism.stages.examined_model",
-        lambda: own.allow(
-            mechanism=settings.model_copy(
-                update={"models": {**settings.models, "qwen3-vl-8b": settings.models["tiny"]}}
-            )
-        ),
-    )
-
-
-def test_a_dataset_has_confabulations_once_the_model_was_run(own: Workspace) -> None:
-    problem = stages.confabulations(own, "tiny").problems["chaotic"]
-    assert problem.startswith("there are no verdicts chaotic|tiny__standard__run1; run the model under standard first")
-    write_verdicts(own, "chaotic", {f"plinko-{n}": n > 1 for n in range(PAIRS)})
-    found = stages.confabulations(own, "tiny")
-    assert "chaotic" not in found.problems and found.scenarios["chaotic"] == {"plinko-0", "plinko-1"}
-
-
-def test_a_model_that_cannot_be_patched_is_left_out(
-    own: Workspace, entry: ModelEntry, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = Asked(datasets=("chaotic",), models=("tiny",), regimes=("standard",), runs=(1,), mechanism=True)
-    patching = own.mechanism.model_copy(update={"patching": PatchingSettings(pairs=1)})
-    own.allow(mechanism=patching, experiments={"inside": asked}, scenarios=["plinko-0001"])
-    text = load_local_model(entry, inside=True).network.config.get_text_config()
-    monkeypatch.setattr(text, "altup_num_inputs", 4, raising=False)  # as Gemma 3n has several residual streams
-
-    def patched_if_wanted() -> object:
-        workspace = Workspace.open(own.root)
-        return patching_rows(workspace, entry, STANDARD) if Wanted(workspace).patches else None
-
-    nothing = remedied(
-        patched_if_wanted,
-        "mechanism.patching_effects.require_patchable",
-        lambda: Workspace.open(own.root).allow(mechanism=patching.model_copy(update={"patching": None})),
-    )
-    assert nothing is None

@@ -10,11 +10,10 @@ import pytest
 from tests.build.commitments import committed
 from tests.conftest import Checkout
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.release.checksums import CHECKSUMS, read_checksums
+from traps_pipeline.release.checksums import CHECKSUMS
 from traps_pipeline.release.commitment import commit, read_commitment
 from traps_pipeline.release.content import content_of, pair_rows
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.release.harness.write import write_harness
 from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.release.submission import pack, read_submission
 from traps_pipeline.release.verification import verify
@@ -55,15 +54,13 @@ def test_a_release_is_written_to_an_empty_a_new_or_a_deleted_folder(workspace: W
             again=lambda other=other: write_release(content, other, Options()),
         )
     remedied(
-        lambda: write_release(content, folder, Options()),
-        "release.folder.write_release",
-        lambda: shutil.rmtree(folder),
+        lambda: write_release(content, folder, Options()), "release.folder.write_release", lambda: shutil.rmtree(folder)
     )
     assert (folder / CHECKSUMS).is_file()
     (folder / "letter.txt").write_text("mine")
     remedied(
         lambda: write_release(content, folder, Options()),
-        "release.folder._clear",
+        "release.folder",
         lambda: (folder / "letter.txt").rename(tmp_path / "letter.txt"),
     )
     remedied(
@@ -77,9 +74,7 @@ def test_a_pair_is_released_once_both_sides_are_there_and_an_arm_that_is_left_ou
     workspace: Workspace, small: Checkout, tmp_path: Path
 ) -> None:
     remedied(
-        lambda: content_of(workspace, ["decoy"]),
-        "release.content.content_of",
-        again=lambda: content_of(workspace),
+        lambda: content_of(workspace, ["decoy"]), "release.content.content_of", again=lambda: content_of(workspace)
     )
     root = tmp_path / "study"
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("ledger", "dagster", "reports"))
@@ -90,38 +85,6 @@ def test_a_pair_is_released_once_both_sides_are_there_and_an_arm_that_is_left_ou
         lambda: pair_rows(content_of(own)),
         "release.content.pair_rows",
         lambda: own.tables.write(ITEMS, partition, whole, {}),
-    )
-
-
-def test_a_harness_is_written_to_an_empty_folder(release: Path, tmp_path: Path) -> None:
-    (tmp_path / "letter.txt").write_text("mine")
-    count = remedied(
-        lambda: write_harness(release, tmp_path),
-        "release.harness.write.write_harness",
-        again=lambda: write_harness(release, tmp_path / "new"),
-    )
-    assert count > 0
-
-
-def test_what_traps_release_wrote_is_verified(release: Path, tmp_path: Path) -> None:
-    remedied(
-        lambda: read_checksums(tmp_path),
-        "release.checksums.read_checksums",
-        again=lambda: read_checksums(release),
-    )
-    remedied(
-        lambda: command("verify", tmp_path),
-        "release.checksums.read_checksums",
-        again=lambda: command("verify", release),
-    )
-
-
-def test_a_release_has_a_date_that_is_one(small: Checkout, tmp_path: Path) -> None:
-    said = ["release", tmp_path / "out", "--workspace", small.workspace, "--date"]
-    remedied(
-        lambda: command(*said, "22.11.2026"),
-        "cli.release._date",
-        again=lambda: command(*said, "2026-11-22"),
     )
 
 
@@ -171,11 +134,7 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
     votes = root / "tables" / "votes"
     aside = votes.rename(tmp_path / "aside")
-    remedied(
-        lambda: pack(Workspace.open(root), path, "small"),
-        "release.submission.pack",
-        lambda: aside.rename(votes),
-    )
+    remedied(lambda: pack(Workspace.open(root), path, "small"), "release.submission.pack", lambda: aside.rename(votes))
 
 
 def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(committed: Path, tmp_path: Path) -> None:
@@ -187,7 +146,7 @@ def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(committe
     )
     remedied(
         lambda: read_commitment(tmp_path / "none.json"),
-        "release.commitment._read",
+        "release.commitment",
         again=lambda: read_commitment(tmp_path / "commitment.json"),
     )
     (copy / "private" / "released" / "draws.json").unlink()

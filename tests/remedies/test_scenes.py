@@ -33,18 +33,9 @@ FOLLOWS = (
 @pytest.mark.parametrize(
     ("wrong", "by"),
     [
-        (
-            {"family": ("FAMILY = ", "MINE = ")},
-            "scenes.family_registry.get_family",
-        ),
-        (
-            {"called": ('"plank_post"', '"plank"')},
-            "scenes.family_registry.get_family",
-        ),
-        (
-            {"category": ('"ramps_rolling"', '"planks"')},
-            "scenes.family_registry.get_family",
-        ),
+        ({"family": ("FAMILY = ", "MINE = ")}, "scenes.family_registry.get_family"),
+        ({"called": ('"plank_post"', '"plank"')}, "scenes.family_registry.get_family"),
+        ({"category": ('"ramps_rolling"', '"planks"')}, "scenes.family_registry.get_family"),
         (
             {
                 "seen": ("seen_m: float = between(0.55, 0.65)", f"seen_m: float = {FOLLOWS}"),
@@ -89,10 +80,5 @@ def test_the_next_renderer_is_opened_once_the_first_is_closed() -> None:
         with Renderer(model, camera) as renderer:
             return next(renderer.frames(np.zeros((1, 0))))
 
-    shown = remedied(
-        draw,
-        "scenes.picture.render.Renderer.__init__",
-        first.close,
-        error=RuntimeError,
-    )
+    shown = remedied(draw, "scenes.picture.render", first.close, error=RuntimeError)
     assert shown.shape == (360, 480, 3)

@@ -49,14 +49,14 @@ def frame(table: Table, *rows: Mapping[str, object]) -> pd.DataFrame:
 
 
 def probes() -> pd.DataFrame:
-    sides = {"n_voids": 16, "n_controls": 16, "layer": 3, "source_best": True, "own_best": True}
+    sides = {"n_voids": 16, "n_controls": 16, "layer": 3, "chosen": True, "own_best": True}
     rows = [
         {"analysis": a, "source": s, "target": t, "value": 0.98, "low": 0.79, "high": 1.0} | sides
         for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"),
                         ("chaotic", "chaotic_time_swapped", "time_swapped"))
     ]  # fmt: skip
     guided = rows[0] | {"prompt": "guided", "value": 0.96}
-    return frame(PROBES, *rows, rows[0] | {"layer": 1, "source_best": False, "value": 0.2}, guided)
+    return frame(PROBES, *rows, rows[0] | {"layer": 1, "chosen": False, "value": 0.2}, guided)
 
 
 def baselines() -> pd.DataFrame:

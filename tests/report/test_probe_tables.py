@@ -28,7 +28,7 @@ def frame(table: Table, rows: list[dict[str, object]]) -> pd.DataFrame:
 
 def states() -> pd.DataFrame:
     """Transfer of two pairs at one layer, Cf->Cf of six voids, one dataset on itself, and what looks like voids."""
-    flags = dict.fromkeys(("own_best", "all_sample_best", "source_best"), True)
+    flags = dict.fromkeys(("own_best", "all_sample_best", "chosen"), True)
     row = flags | {"layer": 3, "low": 0.8, "high": 1.0, "n_voids": 16, "n_controls": 16}
     rows = [row | {"analysis": "transfer", "source": s, "target": t, "value": 0.95} for s, t in PAIRS]
     cf = row | {"source": "occlusion", "target": "occlusion_ill_posed", "n_voids": 6, "n_controls": 6}
@@ -82,7 +82,7 @@ def first(table: PrintedTable) -> dict[str, str]:
 BESIDE = {"Best raw input": "length", "its AUROC": "0.900", "Output margin": "0.800", "Noise": "0.500 ± 0.050"}
 
 
-@pytest.mark.parametrize("name", ["probe_transfer", "probe_within", "probe_answerable"])
+@pytest.mark.parametrize("name", ["probe_transfer", "probe_within"])
 def test_the_best_raw_input_the_output_margin_and_noise_stand_beside_a_probe(name: str) -> None:
     assert BESIDE.items() <= first(tables()[name]).items()
 
@@ -124,12 +124,6 @@ def test_catch_rates_say_what_raw_inputs_and_noise_catch_and_that_controls_are_s
     assert (row["raw"], row["raw_void"], row["margin_void"], row["noise_void"]) == ("length", 0.9, 0.8, 0.5)
     assert row["noise_control"] == pytest.approx(0.3)
     assert first(table)["Catch rate %"] == "75.0 †" and any("same controls" in note for note in table.notes)
-
-
-def test_hidden_or_unknowable_is_of_void_clips_with_an_answerable_question_alone() -> None:
-    row = first(tables()["probe_answerable"])
-    assert row["Unanswerable against answerable"] == "0.400"  # the decoys, which are in probe_look_alikes, have 0
-    assert row["Answerable void against control"] == "1.000"
 
 
 def test_the_papers_tables_have_no_empty_columns_of_baselines() -> None:

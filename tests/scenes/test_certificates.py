@@ -302,7 +302,7 @@ GOOD: dict[str, Any] = {
         "closed_px": 0.0,
         "closed_change_px": 0,
     },
-    "words": {"ill_posed_for": "mass", "question_refuted": None, "premises": 1},
+    "words": {"ill_posed_for": "mass", "question_refuted": None, "premises": 1, "true_answer": None},
 }
 BAD: list[tuple[str, dict[str, Any], str]] = [
     ("outcome", {"label": None}, "the outcome is undecided"),
@@ -349,6 +349,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("words", {"ill_posed_for": None}, "has no answer"),
     ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
     ("words", {"premises": 2}, "presumes 2 things that are not so"),
+    ("words", {"true_answer": "zero"}, "has a true answer: zero"),
 ]
 JUDGES = dict(zip(GOOD, CERTIFICATES, strict=True))
 

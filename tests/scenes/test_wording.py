@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.parts.wording import (
     BEYOND_VIDEO,
     beyond_video,
@@ -16,6 +17,7 @@ from traps_pipeline.scenes.parts.wording import (
     draw_ill_posed,
     false_premise,
     false_premises,
+    none_as_answer,
 )
 from traps_pipeline.scenes.physics.kit import Inventory
 
@@ -77,9 +79,36 @@ def test_drawn_questions_are_refuted_and_plenty(taxonomy: str) -> None:
             lambda text: texts[text] < most,
         )
         assert (beyond_video(question) if taxonomy == "occlusion" else false_premise(question, SCENE)) is not None
-        assert taxonomy == "occlusion" or len(false_premises(question, SCENE, near=True)) == 1, question
+        if taxonomy == "chaotic":
+            assert len(false_premises(question, SCENE, near=True)) == 1, question
+            assert none_as_answer(question) is None, question
         texts[question] += 1
     assert max(texts.values()) <= most
+
+
+@pytest.mark.parametrize(
+    ("question", "answer"),
+    [
+        ("How many windmills does the peg touch?", "zero"),
+        ("How often does the wall hit the domino?", "zero"),
+        ("How many black stripes does the peg have?", "zero"),
+        ("How far does the rope travel?", "zero"),
+        ("How loud is the colour green, in decibels?", "zero"),
+        ("When does the ball pass the magnet?", "never"),
+        ("Does the rope move before or after the zone?", "never"),
+        ("What does the blue ball hit first?", "nothing"),
+        ("What is written on the bell?", "nothing"),
+        ("What does the colour red cost?", "nothing"),
+        ("Does the ball touch the magnet?", "nothing"),
+        ("Is there a windmill?", "no"),
+        ("What colour is the windmill?", None),
+        ("Is the windmill larger or smaller than the ball?", None),
+        ("Where does the blue ball end up?", None),
+        ("What is the weight of the colour red?", None),
+    ],
+)
+def test_a_question_that_none_answers_truly_is_known_by_its_words(question: str, answer: str | None) -> None:
+    assert none_as_answer(question) == answer
 
 
 def test_a_colour_that_is_nearly_there_refutes_nothing() -> None:
@@ -103,3 +132,9 @@ def test_a_scene_with_every_question_taken_is_refused() -> None:
 def test_choices_are_read_as_they_are_listed() -> None:
     assert choices_in("red, blue or green") == ("red", "blue", "green")
     assert choices_in("0-2, 3-4 or 5-6") == ("0-2", "3-4", "5-6")
+
+
+def test_no_released_false_premise_has_a_true_answer() -> None:
+    asked = {id_: spec.ill_posed_question for id_, spec in load_released().items() if spec.taxonomy == "chaotic"}
+    assert len(asked) == 500
+    assert {id_: question for id_, question in asked.items() if none_as_answer(question) is not None} == {}

@@ -28,9 +28,9 @@ KINDS = ("void", "shuffled", "random")  # of the first weights; later studies ra
 class Figure:
     """A figure of one training seed; columns that do not apply to it are empty.
 
-    figure: transfer_best and transfer_source (AUROC of a pair at the layer that is best on the target, and at the
-    source's own), held_out_best and held_out_source (the same, fitted without the scored scenario), shuffled,
-    answerable_void, answerable_control (at the source's own layer), abstention (over all paths and regimes), planted
+    figure: transfer_best and transfer_chosen (AUROC of a pair at the layer that is best on the target, and at the
+    one chosen without it), held_out_best and held_out_chosen (the same, fitted without the scored scenario), shuffled,
+    answerable_void, answerable_control (at the chosen layer), abstention (over all paths and regimes), planted
     (kind: its name in `planted.TRUTHS`). low, high: 95 % interval from resampled scenarios. answers: number of distinct
     answers.
     """
@@ -63,11 +63,11 @@ def figures_of(workspace: Workspace) -> list[Figure]:
     found: list[Figure] = []
     for figure, analysis, flag in (
         ("transfer_best", "transfer", "own_best"),
-        ("transfer_source", "transfer", "source_best"),
+        ("transfer_chosen", "transfer", "chosen"),
         ("held_out_best", "held_out", "all_sample_best"),
-        ("held_out_source", "held_out", "source_best"),
-        ("answerable_void", "answerable_void", "source_best"),
-        ("answerable_control", "answerable_control", "source_best"),
+        ("held_out_chosen", "held_out", "chosen"),
+        ("answerable_void", "answerable_void", "chosen"),
+        ("answerable_control", "answerable_control", "chosen"),
     ):
         rows = probes.loc[(probes["analysis"] == analysis) & probes[flag]]
         if analysis.startswith("answerable"):
@@ -161,13 +161,13 @@ def _planted(figures: Sequence[Figure]) -> list[str]:
 
 
 def _probes(figures: Sequence[Figure]) -> list[str]:
-    lines = ["| AUROC of probes | best layer | its layers | source's own layer | its layers |", "|" + " --- |" * 5]
+    lines = ["| AUROC of probes | best layer | its layers | chosen layer | its layers |", "|" + " --- |" * 5]
     for crossing, label, analysis in (
         *((crossing, crossing, "transfer") for crossing in TRANSFER_TYPES[:3]),
         (TRANSFER_TYPES[0], f"{TRANSFER_TYPES[0]}, fitted without the scored scenario", "held_out"),
     ):
         columns = [label]
-        for name in (f"{analysis}_best", f"{analysis}_source"):
+        for name in (f"{analysis}_best", f"{analysis}_chosen"):
             chosen = [f for f in figures if f.figure == name and transfer_type(f.source, f.target) == crossing]
             columns += [_over_seeds(chosen), _layers(chosen)]
         lines.append(f"| {' | '.join(columns)} |")

@@ -67,7 +67,7 @@ def _own(rows: pd.DataFrame) -> pd.DataFrame:
 def _probe(prompt: str) -> Callable[[Workspace, str], float | None]:
     def of(workspace: Workspace, model: str) -> float | None:
         rows = _own(workspace.tables.read_all(PROBES, model=model, prompt=prompt))
-        return _mean(rows.loc[rows["source_best"].eq(True), "value"])
+        return _mean(rows.loc[rows["chosen"].eq(True), "value"])
 
     return of
 
@@ -81,7 +81,7 @@ def _look_alike(analysis: str) -> Callable[[Workspace, str], float | None]:
     def of(workspace: Workspace, model: str) -> float | None:
         rows = workspace.tables.read_all(PROBES, model=model, prompt="standard")
         rows = rows.loc[(rows["analysis"] == analysis) & (rows["source"] == "occlusion") & (rows["target"] == DECOY)]
-        return _mean(rows.loc[rows["source_best"].eq(True), "value"])
+        return _mean(rows.loc[rows["chosen"].eq(True), "value"])
 
     return of
 

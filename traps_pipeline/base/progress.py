@@ -1,15 +1,20 @@
-"""How long work tells where it stands. Library code reports to `current()`; the command line installs its own."""
+"""Progress of a run: its state and the events that change it. Library code reports to `current()`; a command installs
+a subclass that prints (`cli/progress.py`), and a Dagster step adds a listener (`Progress.heard_by`)."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any, TypeVar
 
 from traps_pipeline.base.terminal import plain
+
+HEARTBEAT_S = 30.0  # between two lines about the same stage
 
 
 @dataclass
@@ -31,20 +36,16 @@ class Tally:
 
 @dataclass
 class Traffic:
-    """Calls to one model or judge in a stage, while they are made. Latencies (s) are the last 500."""
+    """Calls of a stage to one model or judge. Latencies are those of the last 500 calls, in seconds."""
 
-    cached: int = 0
     wanted: int = 0
+    cached: int = 0
     done: int = 0
     errors: int = 0
+    retries: int = 0
     dollars: float = 0.0
     began: float = field(default_factory=lambda: time.monotonic())
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))
-
-    def called(self, failed: bool, latency_s: float, dollars: float) -> None:
-        """A call has come back."""
-        self.done, self.errors, self.dollars = self.done + 1, self.errors + failed, self.dollars + dollars
-        self.latencies.append(latency_s)
 
     @property
     def per_second(self) -> float:
@@ -52,88 +53,220 @@ class Traffic:
         return self.done / max(time.monotonic() - self.began, 1e-9)
 
     def latency_s(self, share: float) -> float:
-        """The latency that this share of the last calls did not exceed."""
+        """Return the latency that this share of the last calls did not exceed."""
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
 
-    @property
-    def left_s(self) -> float:
-        """Seconds until what is wanted so far is done."""
-        return (self.wanted - self.done) / self.per_second if self.done else 0.0
-
-    def line(self) -> str:
-        """The same in words, for where there is no table."""
-        done, cached, errors, pace, p50, p95, dollars, left = self.cells()
-        return f"{done}, {cached} cached, {errors} errors, {pace}, p50 {p50}, p95 {p95}, {dollars}, {left}"
-
-    def cells(self) -> list[str]:
-        """done, cached, errors, calls a second, p50 and p95 latency, dollars, time left."""
-        return [
-            f"{self.done:,} of {self.wanted:,}",
-            f"{self.cached:,}",
-            f"{self.errors:,}",
-            f"{self.per_second:.1f}/s",
-            f"{self.latency_s(0.5):.1f} s",
-            f"{self.latency_s(0.95):.1f} s",
-            f"${self.dollars:,.2f}",
-            f"{clock(self.left_s)} left",
-        ]
+    def figures(self) -> dict[str, float]:
+        """Return the figures by name, as a line of JSON has them."""
+        counts = {name: getattr(self, name) for name in ("done", "wanted", "cached", "errors", "retries")}
+        pace = {"per_second": self.per_second, "p50_s": self.latency_s(0.5), "p95_s": self.latency_s(0.95)}
+        return counts | {name: round(value, 3) for name, value in pace.items()} | {"usd": round(self.dollars, 6)}
 
 
 @dataclass
-class Progress:
-    """Silent progress: counts only. `totals` is by stage, `traffic` by stage and by who is asked."""
+class StageProgress:
+    """The stage that runs: its partitions, and its calls by model or judge. detail: the unit in hand, `share` of which
+    is done. empty: partitions made without rows or files. cells: partitions whose calls are known."""
 
-    totals: dict[str, Tally] = field(default_factory=dict)
-    traffic: dict[tuple[str, str], Traffic] = field(default_factory=dict)
+    name: str
+    partitions: int
+    done: int = 0
+    empty: int = 0
+    cells: int = 0
+    detail: str = ""
+    share: float = 0.0
+    tally: Tally = field(default_factory=Tally)
+    calls: dict[str, Traffic] = field(default_factory=dict)
+    began: float = field(default_factory=lambda: time.monotonic())
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the stage began."""
+        return time.monotonic() - self.began
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the stage is done at its pace so far; None while nothing is known."""
+        total = self.total()
+        begun = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
+        return self.seconds / begun * max(self.partitions - begun, 0.0) if begun and self.partitions else None
+
+    def total(self) -> Traffic:
+        """Return the sum of all calls."""
+        each = [*self.calls.values()]
+        total = Traffic(began=min((one.began for one in each), default=self.began))
+        total.latencies = deque(chain.from_iterable([*one.latencies] for one in each))
+        for name in ("wanted", "cached", "done", "errors", "retries", "dollars"):
+            setattr(total, name, sum(getattr(one, name) for one in each))
+        return total
+
+    def work(self) -> list[str]:
+        """Return what the stage has done, in words."""
+        words = {"asked": "asked", "cached": "from the ledger", "errors": "failed", "frames": "frames"}
+        return [f"{count:,} {words[name]}" for name, count in vars(self.tally).items() if count]
+
+
+class Progress:
+    """The state of a run, without output but for notes. `totals` holds the work by stage."""
+
+    def __init__(self) -> None:
+        self.totals = dict[str, Tally]()
+        self.current_stage: StageProgress | None = None
+        self.spent_usd, self.budget_usd = 0.0, 0.0
+        self._listeners = list[Callable[[str], None]]()
+        self._heard_at = time.monotonic()
+
+    # --- events -------------------------------------------------------------------------------------------------------
 
     def stage(self, name: str, partitions: int) -> None:
-        """A stage begins, with so many partitions to do."""
+        """Begin a stage with this number of partitions to make."""
+        self.end_stage()
+        self.current_stage = StageProgress(name, partitions)
+        self._heard_at = time.monotonic()
 
-    def partition(self, stage: str, key: str, tally: Tally) -> None:
-        """A partition is done."""
+    def partition(self, stage: str, key: str, tally: Tally, *, is_empty: bool = False) -> None:
+        """Count a partition as made. is_empty: it has neither rows nor files."""
         self.totals.setdefault(stage, Tally()).add(tally)
+        if (now := self.current_stage) is not None:
+            now.tally.add(tally)
+            now.done, now.empty = now.done + 1, now.empty + is_empty
+            now.share, now.detail = 0.0, ""
+        self.changed()
 
     def helped(self, stage: str, tally: Tally) -> None:
-        """So much was done for a partition that another run has made."""
+        """Count work for a partition that another run has made."""
         self.totals.setdefault(stage, Tally()).add(tally)
 
     def tick(self, stage: str, what: str, done: int, total: int) -> None:
-        """A unit of a partition (a clip, a call) is done."""
+        """Count units (clips, layers) of the partition in hand."""
+        if (now := self.current_stage) is not None:
+            now.detail, now.share = f"{what}: {done:,} of {total:,}", done / max(total, 1)
+        self.changed()
 
-    def asking(self, stage: str, who: str, wanted: int, cached: int) -> None:
-        """So many more calls are about to be made, so many were in the ledger."""
-        traffic = self.traffic.setdefault((stage, who), Traffic())
-        traffic.wanted, traffic.cached = traffic.wanted + wanted, traffic.cached + cached
+    def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:
+        """Count the calls of a cell before they are made: by model or judge, missing ones and those in the ledger."""
+        if self.current_stage is None:
+            self.current_stage = StageProgress(stage, 0)
+        self.current_stage.cells += 1
+        self.current_stage.detail, self.current_stage.share = "", 0.0
+        for who, (missing, known) in calls.items():
+            traffic = self.current_stage.calls.setdefault(who, Traffic())
+            traffic.wanted, traffic.cached = traffic.wanted + missing, traffic.cached + known
+        self.changed()
 
-    def called(self, stage: str, who: str, failed: bool, latency_s: float, dollars: float) -> None:
-        """A call has come back."""
-        self.traffic[stage, who].called(failed, latency_s, dollars)
+    def called(self, who: str, failed: bool, latency_s: float, dollars: float) -> None:
+        """Count a call that has come back for good."""
+        self.spent_usd += dollars
+        if traffic := self._traffic(who):
+            traffic.done, traffic.errors = traffic.done + 1, traffic.errors + failed
+            traffic.dollars += dollars
+            traffic.latencies.append(latency_s)
+        self.changed()
+
+    def retried(self, who: str) -> None:
+        """Count a call that failed and is made again."""
+        if traffic := self._traffic(who):
+            traffic.retries += 1
+        self.changed()
+
+    def money(self, spent_usd: float, budget_usd: float) -> None:
+        """Set what the study has spent so far, and its budget (0: none)."""
+        self.spent_usd, self.budget_usd = spent_usd, budget_usd
+
+    def end_stage(self) -> None:
+        """End the stage that runs, if any."""
+        if (ended := self.current_stage) is not None:
+            self.current_stage = None
+            if ended.work():
+                for listener in self._listeners:
+                    listener(summary(ended))
 
     def close(self) -> None:
-        """No more is coming."""
+        """End the run."""
+        self.end_stage()
 
     def note(self, text: str) -> None:
-        """Something a person should know."""
+        """Tell a person something about the run."""
         print(plain(text), file=sys.stderr)
+
+    def changed(self) -> None:
+        """Tell the listeners of the stage that runs, at most every 30 s; called after each event."""
+        if self._listeners and time.monotonic() - self._heard_at >= HEARTBEAT_S:
+            self._heard_at = time.monotonic()
+            for listener in self._listeners:
+                listener(self.line())
+
+    # --- state --------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
+        """Give a listener a line about the stage that runs every 30 s, and one at its end, within the block."""
+        self._listeners.append(listener)
+        try:
+            yield
+        finally:
+            self._listeners.remove(listener)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the state by name, as a line of JSON has it."""
+        money = {"spent_usd": round(self.spent_usd, 6), "budget_usd": self.budget_usd}
+        if (now := self.current_stage) is None:
+            return money
+        times = {"seconds": round(now.seconds, 1), "left_s": None if now.left_s is None else round(now.left_s, 1)}
+        calls = {who: traffic.figures() for who, traffic in [*now.calls.items()]}
+        counts = {"stage": now.name, "done": now.done, "partitions": now.partitions, "detail": now.detail}
+        return {**counts, **times, **money, "calls": calls}
+
+    def line(self) -> str:
+        """Return the state on one line."""
+        if (now := self.current_stage) is None:
+            return "between two stages"
+        total, parts = now.total(), [f"{now.done:,} of {now.partitions:,}"] if now.partitions else []
+        if now.detail:
+            parts.append(now.detail)
+        if total.wanted:
+            parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"]
+            parts += [f"{count:,} {name}" for name in ("errors", "retries") if (count := getattr(total, name))]
+            parts += [self.spent()] if self.budget_usd else []
+        if now.left_s is not None:
+            parts.append(f"{clock(now.left_s)} left")
+        return f"{now.name}: {', '.join(parts) or 'begins'}"
+
+    def spent(self) -> str:
+        """Return the money spent and the budget, in words."""
+        return f"${self.spent_usd:,.2f} of ${self.budget_usd:,.2f}"
+
+    def _traffic(self, who: str) -> Traffic | None:
+        return self.current_stage.calls.get(who) if self.current_stage else None
+
+
+def summary(stage: StageProgress) -> str:
+    """Return what a stage has done, on one line."""
+    total = stage.total()
+    retries = [f"{total.retries:,} retried"] if total.retries else []
+    dollars = [f"${total.dollars:,.2f}"] if total.dollars else []
+    parts = [f"{stage.done:,} of {stage.partitions:,} made", *stage.work(), *retries, *dollars, clock(stage.seconds)]
+    return f"{stage.name}: {', '.join(parts)}"
 
 
 def clock(seconds: float) -> str:
-    """m:ss."""
+    """Return a duration as m:ss."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes}:{rest:02d}"
 
 
+AnyProgress = TypeVar("AnyProgress", bound=Progress)
 _current: list[Progress] = [Progress()]
 
 
 def current() -> Progress:
-    """The progress in force."""
+    """Return the progress in force."""
     return _current[-1]
 
 
 @contextmanager
-def reporting(progress: Progress) -> Iterator[Progress]:
+def reporting(progress: AnyProgress) -> Iterator[AnyProgress]:
     """Install a progress for the time of a block."""
     _current.append(progress)
     try:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import sys
+import textwrap
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
 
@@ -54,13 +56,22 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
+def wrapped(text: str) -> str:
+    """Return a line for standard output; on a terminal it is broken between words."""
+    if not sys.stdout.isatty():
+        return text
+    return textwrap.fill(text, shutil.get_terminal_size().columns, break_long_words=False, break_on_hyphens=False)
+
+
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> str:
-    """A table as lines of text for standard output; cells are untrusted.
+    """Return a table as lines of text for standard output; cells are untrusted.
 
     The columns `left` (by place) are aligned to the left, the others to the right. On a terminal the headings are bold
-    with a rule below; elsewhere lines are plain, with two spaces or more between columns. No cell is wrapped or cut.
+    with a rule below, and the last columns are left out and named where it is too narrow; elsewhere lines are plain,
+    with two spaces or more between columns. No cell is wrapped or cut.
     """
     from rich.box import SIMPLE_HEAD
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -68,10 +79,18 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     styled = sys.stdout.isatty()
     box, gap = (SIMPLE_HEAD, 1) if styled else (None, 2)  # a box adds a blank of its own between columns
     table = Table(box=box, padding=(0, gap, 0, 0), show_edge=False, pad_edge=False, header_style="bold")
-    for place, heading in enumerate(headings):
-        table.add_column(Text(plain(heading)), justify="left" if place in left else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*(Text(_printable(str(cell))) for cell in row))
+    cells = [[plain(heading) for heading in headings], *([_printable(str(cell)) for cell in row] for row in rows)]
+    count, hidden = len(headings), ""
+    if styled:
+        widths = [max(map(cell_len, column)) + 2 for column in zip(*cells, strict=True)]
+        columns = shutil.get_terminal_size().columns
+        while count > 1 and sum(widths[:count]) - 2 > columns:
+            count -= 1
+        hidden = f"\nnot shown in {columns} columns: {', '.join(cells[0][count:])}" if count < len(headings) else ""
+    for place, heading in enumerate(cells[0][:count]):
+        table.add_column(Text(heading), justify="left" if place in left else "right", no_wrap=True)
+    for row in cells[1:]:
+        table.add_row(*map(Text, row[:count]))
     lines = io.StringIO()
     Console(file=lines, width=_WIDE, force_terminal=styled).print(table)
-    return redact("\n".join(line.rstrip() for line in lines.getvalue().splitlines()))
+    return redact("\n".join(line.rstrip() for line in lines.getvalue().splitlines()) + hidden)

@@ -16,12 +16,13 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.network import check_network
+from traps_pipeline.base.network import check_network, is_loopback
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.judging.panel import parse_vote, vote_request
@@ -46,7 +47,7 @@ REACH_S = 8.0
 BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
-_FPS, _SIZE, _FRAMES = 10, (160, 120), 50
+_FPS, _SIZE, _FRAMES = 10, (120, 160), 50
 _JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
 _ITEM: Mapping[str, Any] = {
     "item_id": "preflight",
@@ -74,15 +75,11 @@ class Live:
         return redact("\n".join([head, *(f"     {line}" for line in found)]))
 
 
-# --- what is asked ----------------------------------------------------------------------------------------------------
-
-
 @cache
 def _studio() -> tuple[TemporaryDirectory[str], Path, MediaStore]:
     folder = TemporaryDirectory(prefix="traps-live-")
     clip = Path(folder.name) / "clip.mp4"
-    width, height = _SIZE
-    halves = [np.full((height, width, 3), colour, np.uint8) for colour in COLOURS.values()]
+    halves = [np.full((*_SIZE, 3), colour, np.uint8) for colour in COLOURS.values()]
     encode([halves[2 * k // _FRAMES] for k in range(_FRAMES)], clip, _FPS)
     return folder, clip, MediaStore(Path(folder.name) / "media")
 
@@ -166,20 +163,23 @@ def reach(entry: Entry, account: Account) -> Reached:
         return Reached(refused=f"{even}: is the one in {account.key} right?")
     known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
     if known and served_name(entry) not in known:
-        listed = plain(", ".join(known[:8]))[:200]
-        return Reached(unlisted=f"{account.base_url} serves no {served_name(entry)!r}; it lists {listed}")
+        unlisted = f"{account.base_url} serves no {served_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
+        return Reached(unlisted=unlisted)
     return Reached()
 
 
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """The sentence about an address at which nobody answers."""
-    return f"nothing answers at {address} ({why}): start the server there, or mend its `base_url`"
+    """Return the sentence about an address at which nobody answers."""
+    is_here = is_loopback(urlsplit(address).hostname or "")
+    remedy = "start the server there" if is_here else "look at this machine's network and proxy variables"
+    return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
 
 
 def _wrong_key(account: Account) -> str:
     at = f" at {account.base_url}" if account.base_url else ""
-    said = f"the key in {account.key} is not accepted{at}: export the right one" if account.key else ""
-    return said or f"a key is wanted{at}: name its variable as `key`"
+    if account.key:
+        return f"the key in {account.key} is not accepted{at}: export the right one"
+    return f"a key is wanted{at}: name its variable as `key`"
 
 
 def _listed(answer: Any) -> list[Any]:
@@ -190,15 +190,11 @@ def _listed(answer: Any) -> list[Any]:
     return []
 
 
-def _answers_to(name: str, outcomes: Mapping[str, Outcome]) -> bool:
-    """Whether somebody answers under that name, which a server may give with a version behind an @."""
-    return any((outcome.served_model or "").partition("@")[0] == name for outcome in outcomes.values())
-
-
 def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
     """What the outcomes of `requests_of` say of an entry, and what was found before them."""
     problems, notes, before = list[str](), list[str](), reached or Reached()
-    if before.unlisted and not _answers_to(served_name(entry), outcomes):
+    answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
+    if before.unlisted and served_name(entry) not in answering:
         return Live(entry, [before.unlisted])
     if before.unlisted:
         notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
@@ -208,11 +204,11 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
         if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
             continue  # what fails without a schema, too, says nothing of schemas
         if outcome.kind == "error":
-            slow = outcome.error == "timeout"
-            (notes if slow else problems).append(_failure(entry, account, name, str(outcome.error)))
+            sentence = _failure(entry, account, name, str(outcome.error))
+            (notes if outcome.error == "timeout" else problems).append(sentence)
         elif outcome.kind == "malformed":
-            odd = "its answer has no shape of its API; what it is stands above"
-            problems.append(f"{name}: {odd if outcome.error in (None, MALFORMED) else outcome.error}")
+            odd = None if outcome.error == MALFORMED else outcome.error
+            problems.append(f"{name}: {odd or 'its answer has no shape of its API; what it is stands above'}")
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
@@ -243,7 +239,9 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
         case "timeout":
             return f"{name}: no answer within {TIMEOUT_S:.0f} s; a model that thinks for long may need more"
         case "server_error" if name != "schema":
-            return f"{name}: {where} ends in an error of its own (HTTP 5xx), which the server's log explains"
+            return f"{name}: {where} ends in an error of its own; what it said stands above, and in the server's log"
+        case "rate_limited":
+            return f"{where} takes no call now; what it said stands above: wait, or raise the limit or quota there"
         case _ if name == "schema":
             return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
         case _:
@@ -340,7 +338,7 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
                 async with asyncio.timeout(TIMEOUT_S):
                     return await backend.ask(request)
             except TransientError as error:
-                return replace(error.outcome, error=error.why or error.kind)
+                return replace(error.outcome, error=error.why if error.kind == MALFORMED else error.kind)
             except TimeoutError:
                 return Outcome("error", error="timeout")
 

@@ -71,13 +71,13 @@ def import_(arguments: argparse.Namespace) -> int:
 def move(arguments: argparse.Namespace) -> int:
     """See `traps ledger move --help`."""
     from traps_pipeline.base.progress import reporting
-    from traps_pipeline.cli.progress import TerminalProgress
+    from traps_pipeline.cli.progress import make_progress
     from traps_pipeline.storage.place import place_of
     from traps_pipeline.storage.store_move import move_to_store
     from traps_pipeline.storage.workspace import VARIABLE
 
     workspace = open_workspace(arguments)
-    with reporting(TerminalProgress()):
+    with reporting(make_progress()):
         count = move_to_store(workspace, place_of(arguments.store))
     print(f"{count} rows moved; the study lies at {arguments.store} now: export {VARIABLE}={arguments.store}")
     return OK

@@ -1,112 +1,192 @@
-"""Progress on a terminal, or as lines if there is no terminal."""
+"""Progress of a run on standard error: a live region on a terminal, elsewhere lines of text or of JSON."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
-import time
+import threading
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from traps_pipeline.base.progress import Progress, Tally, clock
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, clock, summary
 from traps_pipeline.base.terminal import plain
 
 if TYPE_CHECKING:
-    from rich.live import Live
+    from rich.console import Group
     from rich.table import Table
 
-LIVE_SECONDS = 30.0
-REDRAW_SECONDS, SLOW_CALL_SECONDS = 0.25, 0.2
+Form = Literal["auto", "plain", "json"]
+REDRAWS_A_SECOND = 3
+MOST_ROWS = 12  # models and judges in the live region
+_OF_CALLS = 58  # columns of the live table beside the name
 
 
-class TerminalProgress(Progress):
-    """Prints one line per partition with calls, cache hits and time left. During a long partition it shows the models
-    and judges that are asked: on a terminal as a live table, elsewhere as a line for each every 30 s."""
+def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
+    """Return the progress that a command installs. form: `auto` is a live region where the stream is a terminal."""
+    out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
+    if form == "json":
+        return JsonProgress(out)
+    is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    return LiveProgress(out) if form == "auto" and is_terminal else PrintedProgress(out)
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+
+class PrintedProgress(Progress):
+    """A line for each stage that has asked, rendered or lasted, one for all others together, one every 30 s."""
+
+    def __init__(self, stream: TextIO) -> None:
         super().__init__()
-        self._stream = stream or sys.stdout
-        self._live: Live | None = None
-        self._done, self._total, self._began, self._spoke = 0, 0, time.monotonic(), time.monotonic()
-        self._drawn = 0.0
-        self._deaf = False
+        self._stream, self._is_gone = stream, False
+        self._tables, self._tables_s = 0, 0.0
+        self._closed = threading.Event()
+        threading.Thread(target=self._beat, daemon=True).start()
 
-    def stage(self, name: str, partitions: int) -> None:
+    def end_stage(self) -> None:
         """See `Progress`."""
-        self.close()
-        self._done, self._total, self._began = 0, partitions, time.monotonic()
-        self._say(f"{name}: {partitions} partition{'s' if partitions != 1 else ''} to do")
-
-    def partition(self, stage: str, key: str, tally: Tally) -> None:
-        """See `Progress`."""
-        super().partition(stage, key, tally)
-        self._done += 1
-        counts = [f"{n} {word}" for word, n in vars(tally).items() if n]
-        left = (time.monotonic() - self._began) / self._done * max(self._total - self._done, 0)
-        what = f"{stage:<12} {key or '-':<52} {', '.join(counts) or 'done':<34}"
-        self._say(f"  {what} [{self._done}/{self._total}] {clock(left)} left")
-
-    def tick(self, stage: str, what: str, done: int, total: int) -> None:
-        """See `Progress`."""
-        if time.monotonic() - self._spoke >= LIVE_SECONDS:
-            self._say(f"  {stage:<12} ... {what}: {done} of {total}")
-
-    def called(self, stage: str, who: str, failed: bool, latency_s: float, dollars: float) -> None:
-        """See `Progress`."""
-        super().called(stage, who, failed, latency_s, dollars)
-        if self._stream.isatty():
-            self._show(stage)
-        elif time.monotonic() - self._spoke >= LIVE_SECONDS:
-            for (of, name), traffic in self.traffic.items():
-                if of == stage and traffic.done < traffic.wanted:
-                    self._say(f"  {stage:<12} {name}: {traffic.line()}")
+        ended = self.current_stage
+        super().end_stage()
+        if ended is None or not ended.partitions:
+            return
+        if ended.work() or ended.seconds >= HEARTBEAT_S:
+            self.write(summary(ended))
+        else:
+            self._tables, self._tables_s = self._tables + ended.done - ended.empty, self._tables_s + ended.seconds
 
     def close(self) -> None:
-        """Remove the live table from the terminal."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
-
-    def _show(self, stage: str) -> None:
-        """Draw the live table, at most a few times per second, and only once a call has taken noticeably long."""
-        now = time.monotonic()
-        if self._live is None:
-            if max(traffic.latency_s(1.0) for traffic in self.traffic.values()) < SLOW_CALL_SECONDS:
-                return
-            from rich.console import Console
-            from rich.live import Live
-
-            self._live = Live(console=Console(file=self._stream), auto_refresh=False, transient=True)
-            self._live.start()
-        if now - self._drawn >= REDRAW_SECONDS:
-            self._drawn = now
-            self._live.update(self._table(stage), refresh=True)
-
-    def _table(self, stage: str) -> Table:
-        from rich.table import Table
-
-        table = Table("asked", "done", "cached", "errors", "calls", "p50", "p95", "spent", "left", title=stage)
-        for (of, name), traffic in self.traffic.items():
-            if of == stage:
-                table.add_row(name, *traffic.cells())
-        return table
+        """See `Progress`."""
+        super().close()
+        self._closed.set()
+        if self._tables:
+            word = "table or figure" if self._tables == 1 else "tables and figures"
+            self.write(f"{self._tables:,} {word}, {self._tables_s:.0f} s")
+            self._tables, self._tables_s = 0, 0.0
 
     def note(self, text: str) -> None:
         """See `Progress`."""
-        self._say(f"  ! {text}")
+        self.write(f"! {text}")
 
-    def _say(self, line: str) -> None:
-        self._spoke, line = time.monotonic(), plain(line)  # a provider's or a file's words may be in it
+    def beat(self) -> None:
+        """Print the state of the stage that runs; called every 30 s."""
+        if self.current_stage is not None:
+            self.write(self.line())
+
+    def write(self, line: str) -> None:
+        """Print a line, which may hold a provider's words. A stream that is gone ends the run as SIGTERM would."""
         try:
-            if self._live is not None:
-                self._live.console.print(line, markup=False, highlight=False)
-            else:
-                print(line, file=self._stream, flush=True)
+            self.print_line(plain(line))
         except OSError:
-            if self._deaf:
+            if self._is_gone:
                 return
-            # Nobody listens any more: a closed pipe, a terminal that is gone. The run ends as after SIGTERM.
-            self._deaf, self._stream = True, Path(os.devnull).open("w")  # noqa: SIM115 - until the process ends
-            self._live = None
+            self._is_gone, self._stream = True, Path(os.devnull).open("w")  # noqa: SIM115 - until the process ends
             signal.raise_signal(signal.SIGTERM)
+
+    def print_line(self, line: str) -> None:
+        """Print a line of printable text."""
+        print(line, file=self._stream, flush=True)
+
+    def _beat(self) -> None:
+        while not self._closed.wait(HEARTBEAT_S):
+            self.beat()
+
+
+class JsonProgress(PrintedProgress):
+    """The same as lines of JSON: `begin` and `end` of each stage, `progress` every 30 s, `note`."""
+
+    def stage(self, name: str, partitions: int) -> None:
+        """See `Progress`."""
+        super().stage(name, partitions)
+        self._event("begin", self.figures())
+
+    def end_stage(self) -> None:
+        """See `Progress`."""
+        if self.current_stage is not None:
+            self._event("end", self.figures() | vars(self.current_stage.tally))
+        Progress.end_stage(self)
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+        self._event("note", {"text": plain(text)})
+
+    def beat(self) -> None:
+        """See `PrintedProgress`."""
+        if self.current_stage is not None:
+            self._event("progress", self.figures())
+
+    def _event(self, name: str, values: dict[str, Any]) -> None:
+        at = datetime.now(UTC).isoformat(timespec="seconds")
+        self.write(json.dumps({"event": name, "at": at, **values}, ensure_ascii=False))
+
+
+class LiveProgress(PrintedProgress):
+    """A region at the bottom of the terminal for the whole run; lines of ended stages and notes scroll above it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        super().__init__(stream)
+        self._console = Console(file=stream, highlight=False, markup=False, emoji=False)
+        self._live = Live(
+            console=self._console,
+            get_renderable=self._region,
+            refresh_per_second=REDRAWS_A_SECOND,
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),
+        )
+        self._live.start()
+
+    def close(self) -> None:
+        """See `Progress`."""
+        self._live.stop()
+        super().close()
+
+    def beat(self) -> None:
+        """Print nothing: the region shows it."""
+
+    def print_line(self, line: str) -> None:
+        """See `PrintedProgress`."""
+        from rich.text import Text
+
+        self._console.print(Text(line))
+
+    def _region(self) -> Group:
+        from rich.console import Group
+        from rich.text import Text
+
+        if (now := self.current_stage) is None:
+            return Group()
+        lines: list[Any] = [Text(self._heading(now), style="bold", no_wrap=True, overflow="ellipsis")]
+        if now.detail:
+            lines.append(Text(plain(f"  {now.detail}"), no_wrap=True, overflow="ellipsis"))
+        return Group(*lines, *([self._calls(now)] if now.calls else []))
+
+    def _heading(self, now: StageProgress) -> str:
+        """Return the stage, its partitions, times and money; at most 80 columns for names of up to 20."""
+        counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
+        left = "" if now.left_s is None else f", {clock(now.left_s)} left"
+        money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
+        return f"{now.name}{counts}  {clock(now.seconds)}{left}{money}"
+
+    def _calls(self, now: StageProgress) -> Table:
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+        table.add_column("")
+        for heading in ("done", "calls", "p50", "p95", "errors", "retries", "spent"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        rows = sorted(now.calls.items(), key=lambda pair: pair[1].done >= pair[1].wanted)
+        most = max(1, min(MOST_ROWS, self._console.height - 6))
+        for who, traffic in rows[:most]:
+            name = Text(plain(who), no_wrap=True)
+            name.truncate(max(10, self._console.width - _OF_CALLS), overflow="ellipsis")
+            done, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
+            latencies = [f"{traffic.latency_s(share):.1f} s" for share in (0.5, 0.95)]
+            table.add_row(
+                name, done, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
+            )
+        if len(rows) > most:
+            table.add_row(f"and {len(rows) - most} more")
+        return table

@@ -57,7 +57,12 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--until", metavar="STAGES", help="make only these stages (separated by commas) and the stages they need"
     )
-
+    parser.add_argument(
+        "--progress",
+        choices=("auto", "plain", "json"),
+        default="auto",
+        help="on standard error: a live region on a terminal and lines elsewhere (auto), lines, or lines of JSON",
+    )
     parser.add_argument(
         "--cluster", action="store_true", help="make it on the hosts of a Ray cluster (docs/cluster.md)"
     )
@@ -87,7 +92,7 @@ def add(commands: Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
     from traps_pipeline.base.progress import reporting
-    from traps_pipeline.cli.progress import TerminalProgress
+    from traps_pipeline.cli.progress import make_progress
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
@@ -95,12 +100,12 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.pipeline.experiment_run import run_experiment
 
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
-    with reporting(TerminalProgress()):
+    with reporting(make_progress(arguments.progress)) as shown:
         report = run_experiment(
             workspace,
             experiment,
             until=arguments.until,
-            preflight=None if arguments.no_preflight else partial(print, flush=True),
+            preflight=None if arguments.no_preflight else shown.write,
             look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
             open_runs=partial(_open_runs, arguments),
         )
@@ -108,8 +113,9 @@ def run(arguments: argparse.Namespace) -> int:
     if experiment.canary and not report.problems:
         from traps_pipeline.checks.canary import ask_canary, changes_text
 
-        with reporting(TerminalProgress()):
-            print(changes_text(ask_canary(workspace, experiment.models)))
+        with reporting(make_progress(arguments.progress)):
+            changes = ask_canary(workspace, experiment.models)
+        print(changes_text(changes))
     if report.problems:
         _print_problems(report.problems)
         return OVER_BUDGET if report.over_budget else FAILED
@@ -117,7 +123,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK
     _print_results(workspace)
-    print(f"next: open {workspace.reports / 'report.html'}, or run traps why ITEM to examine an item's answers")
+    print(f"report {workspace.reports / 'report.html'}")
+    print("next: open the report; traps why ITEM examines an item's answers; traps site writes the explorer")
     return OK
 
 
@@ -125,10 +132,9 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
     from traps_pipeline.base.progress import clock
 
     asked, voted = report.tally("responses"), report.tally("votes")
-    print(
-        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
-        f"({voted.cached} from the ledger), {report.frames} frames rendered, {clock(report.seconds)} min"
-    )
+    print(f"\n{asked.asked} answers asked ({asked.cached} from the ledger)")
+    print(f"{voted.asked} votes asked ({voted.cached} from the ledger)")
+    print(f"{report.frames} frames rendered, {clock(report.seconds)} min")
     if is_inside:
         states, steered, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
         print(
@@ -207,6 +213,3 @@ def _print_results(workspace: Workspace) -> None:
 
     said = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
     print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST), said))
-    pictures = ("figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
-    for name in ("report.html", "leaderboard.md", "gallery.html", *pictures):
-        print(workspace.reports / name)

@@ -14,15 +14,11 @@ VoteEpochs = Annotated[str, "campaigns of the votes, joined by +"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)  # a large cell has 450,000
-class VoteRow:
+class VoteRow(shared.CellRow):
     """One judge's vote on one task about one answer."""
 
     item_id: shared.ItemId
     side: shared.Side
-    dataset: shared.CellDataset
-    model: shared.Model
-    regime: shared.Regime
-    run: shared.Run
     task: Task
     judge: shared.Judge
     panel: shared.Panel
@@ -49,7 +45,7 @@ VOTES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerdictRow:
+class VerdictRow(shared.CellRow):
     """The panel's verdict on one item."""
 
     item_id: shared.ItemId
@@ -59,10 +55,6 @@ class VerdictRow:
     category: shared.Category
     sub_scenario: shared.SubScenario
     control_answer: Annotated[str, "the pair's control answer"]
-    dataset: shared.CellDataset
-    model: shared.Model
-    regime: shared.Regime
-    run: shared.Run
     outcome: Annotated[str, "of the response, only an answer being judged; unread where no judge could read it"]
     is_json: Annotated[bool | None, "of the response, in the JSON regime"]
     abstained: Annotated[bool | None, "majority; null if missing or undecided"]
@@ -134,7 +126,7 @@ JUDGE_BIAS = Table("judge_bias", JudgeBiasRow, partition_by=(), key=("dataset", 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConfabulationRow:
+class ConfabulationRow(shared.CellRow):
     """One sampled void failure with its four labels; no row where no judge is configured for the study's panel."""
 
     sample_id: Annotated[
@@ -142,10 +134,6 @@ class ConfabulationRow:
         "id that an annotator sees instead of model and item: it reveals neither, and changes with the answer",
     ]
     item_id: Annotated[str, "dataset:scenario_id:void"]
-    dataset: shared.CellDataset
-    model: shared.Model
-    regime: shared.Regime
-    run: shared.Run
     void_kind: Annotated[str, "occluder, truncation or question"]
     evidence: Annotated[
         str,

@@ -198,6 +198,8 @@ class Ledger:
             contents = [(writers[name], _Content.of(*stored)) for name in new for stored in new[name]]
 
             def change(batch: Batch) -> None:
+                for writer in writers.values():  # before the first row: all of them or none
+                    writer.check(batch)
                 for writer, content in contents:
                     writer.add(batch, content, ())
 
@@ -284,11 +286,7 @@ class Writer:
 
     def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
         """Add a row to a transaction. Raises TrapsError where another process writes this evaluation now."""
-        if not batch.is_writer(self._evaluation):
-            raise TrapsError(
-                f"{self._database.place}: another process has begun to ask the same calls, since this one was away; "
-                "nothing more is sent. Run the same command again when the other one has ended"
-            )
+        self.check(batch)
         batch.rows.append(content.values(self._evaluation))
         participant = participant_of(content.row)
         its = batch.totals.setdefault((self._kind, participant), Totals())
@@ -297,6 +295,14 @@ class Writer:
         if its.dollars > before:
             batch.spend(participant, its.dollars - before)
         batch.cover(participant, paid_by)
+
+    def check(self, batch: Batch) -> None:
+        """Raises TrapsError where another process writes this evaluation now."""
+        if not batch.is_writer(self._evaluation):
+            raise TrapsError(
+                f"{self._database.place}: another process has begun to ask the same calls, since this one was away; "
+                "nothing more is sent. Run the same command again when the other one has ended"
+            )
 
     async def sync(self) -> None:
         """Bring what was written to the disk. Raises TrapsError."""

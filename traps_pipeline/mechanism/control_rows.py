@@ -114,7 +114,7 @@ class GateRow(Extracted):
     target: Annotated[
         str, "dataset; all: mean over the four; or items without a pair, of which false_abs alone is known"
     ]
-    layer: Annotated[int, "of the states, chosen by the sources' own cross-validation; -1 for other features"]
+    layer: Annotated[int, "of the states, chosen on pairs of other datasets than the target; -1 for other features"]
     auroc: Annotated[float | None, "of the gate's scores on the target"]
     acc: Share
     false_abs: Share

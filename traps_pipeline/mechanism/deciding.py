@@ -11,7 +11,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.directions import steered_scenarios
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
-from traps_pipeline.mechanism.gating import best_layers, gate_items, gate_table, layer_of
+from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.capture import OF_PARTS, Pooling
@@ -79,7 +79,7 @@ def fitted_gate(
             "set `pooling: last`"
         )
     if layer is None:
-        layer = layer_of(best_layers(workspace, states), source, target)
+        layer = chosen_layers(workspace, states, [target])[target]
     if not 0 <= layer < states.n_layers:
         raise TrapsError(f"no layer {layer}; these states have layers 0 to {states.n_layers - 1}")
     train = _train(states, source, target, layer, without)

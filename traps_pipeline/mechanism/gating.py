@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -18,7 +18,6 @@ from traps_pipeline.mechanism.control_rows import GateRow, RiskCoverageRow
 from traps_pipeline.mechanism.gate import (
     MID,
     OTHER_DATASETS,
-    OTHER_FAMILIES,
     SOURCES,
     THRESHOLDS,
     Decisions,
@@ -30,6 +29,7 @@ from traps_pipeline.mechanism.gate import (
     separation,
     sources_of_gate,
 )
+from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.mechanism.nulls import nulled
 from traps_pipeline.mechanism.probes import swapped_labels
@@ -103,11 +103,11 @@ def _each(
             "experiment must ask the model under one of these regimes"
         )
     table = gate_table(states)
-    best = best_layers(workspace, states)
-    kinds = [*_kinds(workspace, entry, states, best, sources)]
+    layers = chosen_layers(workspace, states, dict.fromkeys(states.items["dataset"]))
+    kinds = [*_kinds(workspace, entry, states, layers, sources)]
     for number, gates in enumerate(kinds):
         progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
-        made = _decisions(workspace, table, gates, best)
+        made = _decisions(workspace, table, gates, layers)
         for regime, source in product(outcomes, gates.sources):
             own = {target: one for (of, target), one in made.items() if of == source}
             yield regime, outcomes[regime], gates.name, source, own
@@ -120,29 +120,19 @@ def gate_table(states: StoredStates) -> pd.DataFrame:
     return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
 
 
-def best_layers(workspace: Workspace, states: StoredStates) -> dict[str, int]:
-    """The layer of each source's gates: the highest mean AUROC of its datasets' own cross-validations. For `other
-    datasets` the key is that with the target behind a colon."""
-    probes = workspace.tables.read(PROBES, states.extraction.partition)
-    within = probes.loc[probes["analysis"] == "within"].pivot(index="layer", columns="source", values="value")
-    of = {f"one:{name}": [name] for name in within}
-    of |= {f"{OTHER_DATASETS}:{name}": [other for other in within if other != name] for name in DATASETS}
-    every = {source: [*within] for source in SOURCES if source not in of and source != OTHER_DATASETS}
-    return {source: int(within[names].mean(axis=1).idxmax()) for source, names in (of | every).items() if names}
-
-
-def layer_of(best: Mapping[str, int], source: str, target: str) -> int:
-    """The layer of a source's gates for a target, of `best_layers`. To a target that is no dataset of pairs all four
-    datasets are others, as they are to other families."""
-    return best.get(f"{source}:{target}", best.get(source, best[OTHER_FAMILIES]))
+def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
+    """Return the layer of the gates of each target, chosen without its labels (`layer_choice`)."""
+    rows = workspace.tables.read(PROBES, states.extraction.partition).to_dict("records")
+    curves = pair_curves({str(name): value for name, value in row.items()} for row in rows)
+    return {target: layer_choice(curves, target).layer for target in targets}
 
 
 def _kinds(
-    workspace: Workspace, entry: ModelEntry, states: StoredStates, best: Mapping[str, int], sources: Sequence[str]
+    workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int], sources: Sequence[str]
 ) -> Iterator[Gates]:
     """States with every source; the controls with the sources that no single dataset's accidents decide."""
     names = [*dict.fromkeys(states.items["dataset"])]
-    yield Gates(STATES, {layer: _read(states, names, layer) for layer in sorted(set(best.values()))}, sources)
+    yield Gates(STATES, {layer: _read(states, names, layer) for layer in sorted({*layers.values()})}, sources)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
@@ -152,7 +142,7 @@ def _kinds(
         yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
     except NoMargin as error:
         progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, {layer: _read(states, names, layer) for layer in sorted(set(best.values()))}, controls)
+    yield Gates(SHUFFLED, {layer: _read(states, names, layer) for layer in sorted({*layers.values()})}, controls)
     if workspace.mechanism.gate.untrained:
         from traps_pipeline.mechanism.untrained import untrained_states
 
@@ -164,7 +154,7 @@ def _read(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, n
 
 
 def _decisions(
-    workspace: Workspace, table: pd.DataFrame, gates: Gates, best: Mapping[str, int]
+    workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]
 ) -> dict[tuple[str, str], tuple[Decisions, int]]:
     """By source and target, a gate's decisions and the layer of its states (-1 for other features)."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
@@ -174,8 +164,7 @@ def _decisions(
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
         if not sources_of_gate(source, str(target), there):
             continue  # a study of some datasets has the gates that these allow
-        layer = layer_of(best, source, str(target))
-        layer = layer if layer in gates.by_layer else -1
+        layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
         items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
         found = decide(items, source, str(target), solver=settings.probes.solver, **about)
         if np.isfinite(found.score).any():

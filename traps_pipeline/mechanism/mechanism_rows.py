@@ -149,10 +149,7 @@ class ProbeRow(Extracted):
     n_controls: Annotated[int, "control items of the target"]
     own_best: Annotated[bool, "whether this layer has the highest value of its own curve (uses target labels)"]
     all_sample_best: Annotated[bool, "whether this pair's transfer curve is highest at this layer (uses target labels)"]
-    source_best: Annotated[
-        bool,
-        "whether the source's own cross-validation is highest at this layer (uses no target label)",
-    ]
+    chosen: Annotated[bool, "whether the target is read at this layer, chosen on pairs of other datasets alone"]
     note: Annotated[str | None, "why there is no figure"]
     made_of: Annotated[
         str,

@@ -17,6 +17,7 @@ import pandas as pd
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.probes import (
     Fit,
     Split,
@@ -346,15 +347,15 @@ def _row(
         **{"analysis": analysis, "source": path[0], "target": path[1], "layer": layer, "scope": scope},
         **{name: None if figure is None else float(figure) for name, figure in figures.items()},
         **{"n_voids": n_void, "n_controls": len(of.void) - n_void if of else 0, "note": note},
-        **{"own_best": False, "all_sample_best": False, "source_best": False},
+        **{"own_best": False, "all_sample_best": False, "chosen": False},
     }
 
 
 def marked(rows: Sequence[Row]) -> list[Row]:
-    """The rows with marks on the layers that tables show: own_best, the maximum of the row's own curve (the paper's
-    choice, which uses target labels); all_sample_best, the maximum of the pair's all-sample transfer curve;
-    source_best, the maximum of the source's grouped cross-validation, which uses no target label. Of several layers
-    with the same maximum, the lowest is marked.
+    """Return the rows with marks on the layers that tables show: own_best, the maximum of the row's own curve (the
+    paper's choice, which uses target labels); all_sample_best, the maximum of the pair's all-sample transfer curve;
+    chosen, the layer of the target without its labels (`layer_choice`). Of several layers with the same maximum the
+    lowest is best.
     """
     curves: dict[tuple[str, str, str], dict[int, float]] = {}
     for row in rows:
@@ -362,6 +363,9 @@ def marked(rows: Sequence[Row]) -> list[Row]:
             key = (row["analysis"], row["source"], row["target"])
             curves.setdefault(key, {})[row["layer"]] = row["value"]
     best = {key: min(curve, key=lambda layer: (-curve[layer], layer)) for key, curve in curves.items()}
+    of_pairs = pair_curves(rows)
+    targets = {row["target"] for row in rows if row["analysis"] in CURVES}
+    chosen = {target: layer_choice(of_pairs, target).layer for target in targets} if of_pairs else {}
     return [
         row
         if row["analysis"] not in CURVES
@@ -369,7 +373,7 @@ def marked(rows: Sequence[Row]) -> list[Row]:
         | {
             "own_best": best.get((row["analysis"], row["source"], row["target"])) == row["layer"],
             "all_sample_best": best.get(("transfer", row["source"], row["target"])) == row["layer"],
-            "source_best": best.get(("within", row["source"], row["source"])) == row["layer"],
+            "chosen": chosen.get(row["target"]) == row["layer"],
         }
         for row in rows
     ]

@@ -160,13 +160,13 @@ class ApiBackend:
         except OddShapeError as error:
             raise self._malformed(str(error), exchange.content) from None
         if reply.ending == "transient":
-            self._tell("ended", f"its answer ended with {reply.finish!r} and is asked again")
+            self._tell("ended", f"its answer ended with {reply.finish!r}", passes=True)
             cost_usd = self._outcome(reply, request).cost_usd
             raise TransientError(f"ended_{reply.finish.strip().lower()}", cost_usd=cost_usd)
         return self._outcome(reply, request)
 
     def _malformed(self, why: str, content: bytes = b"") -> TransientError:
-        self._tell(MALFORMED, why)
+        self._tell(MALFORMED, why, passes=True)
         raw = redact(content.decode("utf-8", "replace"))[:MOST_KEPT]
         return TransientError(MALFORMED, raw=raw, why=redact(why))
 
@@ -210,29 +210,32 @@ class ApiBackend:
 
         if exchange.never_left:
             why = redact(plain(exchange.problem or cause_of(error)))
-            self._tell(UNREACHABLE, why)
+            self._tell(UNREACHABLE, why, passes=True)
             raise TransientError(UNREACHABLE, billed=False, why=why) from None
-        if (reported := read_error(exchange.content)) is not None:
+        reported = read_error(exchange.content)
+        if reported is not None or (exchange.status is not None and not exchange.is_answered):
             return self._reported(reported, exchange)
-        if exchange.status is not None and not exchange.is_answered:
-            return self._reported(ProviderError(self._beginning(exchange)), exchange)
         kind = "timeout" if isinstance(error, self._litellm.Timeout) else "connection"
-        self._tell(kind, exchange.problem or cause_of(error))
+        self._tell(kind, exchange.problem or cause_of(error), passes=True)
         raise TransientError(kind) from None
 
-    def _reported(self, reported: ProviderError, exchange: Exchange) -> Outcome:
+    def _reported(self, error: ProviderError | None, exchange: Exchange) -> Outcome:
         """Return what a provider reports as an outcome, or raise it as TransientError. The status is the one on the
-        wire, or the one in the body where that came with a 200."""
+        wire, or the one in the error object where that came with a 200. error: None if the body holds none."""
+        reported = error or ProviderError(self._beginning(exchange))
         status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
-        billed = exchange.may_be_billed(status)
-        through = f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
+        is_explained = error is not None and not error.is_beside_answer
+        billed = exchange.may_be_billed(status, is_explained=is_explained)
+        place = " (an error object in an HTTP 200)" if exchange.is_answered else ""
+        place += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if reported.is_filtered and status not in TRANSIENT_STATUSES:
-            self._tell(REFUSED_CONTENT, f"{reported}{through}")
+            self._tell(REFUSED_CONTENT, f"{reported}{place}")
             return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
         kind = failure_kind(status, reported)
-        self._tell(kind, f"{reported}{through}")
-        if kind.startswith("http_"):
+        is_final = kind.startswith("http_")
+        self._tell(kind, f"{reported}{place}", passes=not is_final)
+        if is_final:
             return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
         raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None
 
@@ -243,12 +246,13 @@ class ApiBackend:
         begins = f", beginning {text[:60]!r}" if text.strip() else ""
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
-    def _tell(self, kind: str, said: str) -> None:
-        """Say once for each kind what the provider said, without the key."""
+    def _tell(self, kind: str, said: str, *, passes: bool = False) -> None:
+        """Say once for each kind what the provider said, without the key. passes: whether another try may help."""
         if kind not in self._told:
             self._told.add(kind)
             said = redact(" ".join(said.split()))  # before it is cut
-            progress.current().note(f"{self._entry.id}: {kind}: {plain(said)[:300]}")
+            again = " (a run tries again)" if passes else ""
+            progress.current().note(f"{self._entry.id}: {kind}{again}: {plain(said)[:300]}")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

@@ -105,6 +105,8 @@ def collect(
         sharing(workspace, known.values()) as sharers,
         spending(workspace, known.values()) as budget,
     ):
+        if any(entry.prices for entry in known.values()):
+            progress.current().money(budget.spent_usd, workspace.study.budget_usd)
         participants = Participants(known, make, workspace.study, sharers=sharers)
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
         yield from run_work(work, cells)
@@ -140,7 +142,7 @@ class _Asking:
         row, beside = ledger_row(request, *attempted, self.work.epoch)
         await self.writer.write(row, beside, [reservation.id for reservation in allowed.paid_by])
         self.rows[request.key] = _Held(row)
-        progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
+        progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
         participant.breaker.watch(attempted[0])
         return True
 
@@ -238,8 +240,8 @@ async def _settle_cell(
     rows = {key: _Held(row) for key, row in known.settled.items()}
     missing = [request for key, request in wanted.items() if key not in rows]
     new = Counter(request.participant for request in missing)
-    for name, count in Counter(request.participant for request in wanted.values()).items():
-        report.asking(work.stage, name, new[name], count - new[name])
+    counts = Counter(request.participant for request in wanted.values())
+    report.asking(work.stage, {name: (new[name], count - new[name]) for name, count in counts.items()})
     asking = _Asking(work, its.writer, missing, stop)
     await asking.run()
     rows |= asking.rows

@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
+from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.rows import ASIDES
 from traps_pipeline.models.budget import Budget, BudgetReached, Reservation, check_money, most_tokens, worst_case_usd
@@ -163,6 +164,7 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
         malformed += failure.kind == MALFORMED
         if number > limits.retries or malformed == MALFORMED_TRIES:
             return _given_up(failure.kind, number, seconds, lost_usd, failure.raw)
+        progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
         if await _stopped_within(allowed.stop, wait):

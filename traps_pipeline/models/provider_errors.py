@@ -8,7 +8,7 @@ import math
 import re
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -41,12 +41,14 @@ _UNIT_S = {"h": 3600.0, "m": 60.0, "s": 1.0, "ms": 0.001}
 @dataclass(frozen=True)
 class ProviderError:
     """An error object. status: the HTTP status that it carries or stands for, None if its words are unknown; words:
-    codes and types, as the provider has them; details: what belongs to it besides."""
+    codes and types, as the provider has them; details: what belongs to it besides; is_beside_answer: whether the body
+    holds choices or a usage, too, so that something was generated."""
 
     message: str
     words: tuple[str, ...] = ()
     status: int | None = None
     details: tuple[Mapping[str, Any], ...] = ()
+    is_beside_answer: bool = False
 
     @property
     def is_filtered(self) -> bool:
@@ -80,8 +82,11 @@ def read_error(content: bytes | None) -> ProviderError | None:
     if not error and (body.get("object") == "error" or _is_flat(body)):  # vLLM; gateways
         error = body
     if isinstance(error, str):
-        return ProviderError(error, tuple(_words(body)), _status(body))
-    return _read(error) if isinstance(error, Mapping) else None
+        reported = ProviderError(error, tuple(_words(body)), _status(body))
+    else:
+        reported = _read(error) if isinstance(error, Mapping) else None
+    is_beside_answer = any(body.get(name) for name in ("choices", "usage", "usageMetadata"))
+    return reported and replace(reported, is_beside_answer=is_beside_answer)
 
 
 def _is_flat(body: Mapping[str, Any]) -> bool:

@@ -8,16 +8,12 @@ from traps_pipeline.storage.tables import Table
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)  # a large cell has 100,000
-class ResponseRow:
+class ResponseRow(shared.CellRow):
     """One answer of one model in one run."""
 
     item_id: shared.ItemId
     pair_id: shared.PairId
     side: shared.Side
-    dataset: shared.CellDataset
-    model: shared.Model
-    regime: shared.Regime
-    run: shared.Run
     outcome: shared.AnswerOutcome
     text: Annotated[str | None, "the visible answer; null unless outcome is answer"]
     reasoning: Annotated[str | None, "the trace, where the provider returns it"]

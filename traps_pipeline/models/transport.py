@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-# Statuses by which a server says that it did not take the call. 408 and 499 tell of a call that it gave up.
-_TAKEN = (408, 499)
+_GIVEN_UP = (408, 499, 504, 524)  # statuses of a call that a server took and gave up, so that its work may be billed
 _NOT_TAKEN = (503, 529)
 
 
@@ -39,14 +38,19 @@ class Exchange:
         """Whether a server said that it did what it was asked to."""
         return self.status is not None and 200 <= self.status < 300
 
-    def may_be_billed(self, status: int | None = None) -> bool:
-        """Return whether the provider may charge for it. status: the status in its body, or in a library's error, where
-        that counts in the place of the one on the wire."""
+    def may_be_billed(self, status: int | None = None, *, is_explained: bool = False) -> bool:
+        """Return whether the provider may charge for it.
+
+        status: the status in its body, where that counts in the place of the one on the wire. is_explained: whether an
+        error object of the provider's stands in the place of an answer; a page of a proxy on the way tells nothing of
+        what the provider did.
+        """
         if self.never_left:
             return False
         status = self.status if status is None else status
-        refused = status is not None and 400 <= status < 500 and status not in _TAKEN
-        return not (refused or status in _NOT_TAKEN)
+        if status is None or status in _GIVEN_UP:
+            return True
+        return not (400 <= status < 500 or status in _NOT_TAKEN or (is_explained and status >= 500))
 
 
 WATCHED: ContextVar[Exchange | None] = ContextVar("watched", default=None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
@@ -16,7 +15,8 @@ from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.scenes.picture.trial import OPENGL, check_rendering
+from traps_pipeline.scenes.picture.trial import check_rendering, opengl_variables
+from traps_pipeline.scenes.worlds.clip_cache import ClipCache
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: 
 def require_machine(workspace: Workspace, parts: Parts) -> None:
     """Check what a run still needs for these partitions: disk, OpenGL and codecs, proxies and certificates.
 
-    Raises TrapsError, one sentence, for the first that is missing. A study whose clips exist needs no OpenGL, and one
-    whose answers and votes exist no network.
+    Raises TrapsError, one sentence, for the first that is missing or that a variable keeps from working. A study whose
+    clips exist needs no OpenGL, and one whose answers and votes exist no network.
     """
     check_disk(workspace.root, LEAST_GB)
     if any(entry.backend == NETWORK for entry in _asked(workspace, parts)):
@@ -64,7 +64,8 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
     graph = the_graph()
     drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
     if any(shared is not None and shared.seconds(workspace, key) > 0 for shared, key in drawing):
-        _check_rendering(*(os.environ.get(name) for name in OPENGL))
+        ClipCache.of_user()
+        _check_rendering(*opengl_variables().items())
 
 
 def _asked(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
@@ -85,6 +86,6 @@ def _asked(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
 
 
 @cache
-def _check_rendering(*_: str | None) -> None:
+def _check_rendering(*_: tuple[str, str]) -> None:
     """Check it once a process for the same variables."""
     check_rendering()

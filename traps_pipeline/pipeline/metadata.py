@@ -57,9 +57,12 @@ def preview(table: Table, made: Made) -> dict[str, dg.TableMetadataValue]:
 
     What a model wrote is shown on the report's pages, where it is escaped.
     """
+    import pandas as pd
+
     content = cast(Any, made.content)
     if ranked := next((name for name in RANKED if name in table.names), None):
-        ordered = made.frame.dropna(subset=[ranked]).sort_values(ranked, ascending=False, kind="stable")
+        frame = content if hasattr(content, "head") else pd.DataFrame(content, columns=pd.Index(table.names))
+        ordered = frame.dropna(subset=[ranked]).sort_values(ranked, ascending=False, kind="stable")
         best, worst = ordered.head(PREVIEWED), ordered.iloc[PREVIEWED:].tail(PREVIEWED)
         shown = {f"best by {ranked}": best.to_dict("records"), f"worst by {ranked}": worst.to_dict("records")}
     else:

@@ -84,7 +84,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
             write_text(home / "dagster.yaml", yaml.safe_dump(settings, sort_keys=False))
         workspace.copy_dagster_yaml(home)
         try:
-            instance = dg.DagsterInstance.from_config(str(home))
+            instance = _instance(home, is_captured=workspace.is_on_cluster)
             instance.get_runs_count()
             instance.all_asset_keys()  # of the other file
         except OperationalError:
@@ -101,6 +101,15 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         else:
             return instance
     raise AssertionError("unreachable: the second try returns or raises")
+
+
+def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
+    """Open the instance of a folder. is_captured: whether steps print into files of Dagster's, as runs on other hosts
+    must. In this process that would keep progress from the terminal, and start four processes for every step."""
+    if is_captured:
+        return dg.DagsterInstance.from_config(str(home))
+    silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
+    return dg.DagsterInstance.local_temp(str(home), overrides={"compute_logs": silent})
 
 
 def _alive(pid: int) -> bool:

@@ -55,7 +55,7 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
     for key, made in step.make():
         version = step.write(key, made)
         yield from step.checks.of_made(key, made)
-        progress.current().partition(stage.name, key or "", made.tally)
+        progress.current().partition(stage.name, key or "", made.tally, is_empty=not len(made.content))
         metadata = partition_metadata(workspace, stage, made) | {TALLY: json.dumps(vars(made.tally))}
         if stage.scheme is None:
             metadata = visible_metadata(metadata)
@@ -171,10 +171,14 @@ class _Step:
 
 
 def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Pass a step's events on; keep keys out of the traceback that Dagster stores, and call a run that a person stopped
-    by a signal canceled: Dagster, which did not stop it itself, would call it a failure."""
+    """Pass a step's events on, with its progress in Dagster's log; keep keys out of the traceback that Dagster stores,
+    and call a run that a person stopped by a signal canceled: Dagster, which did not stop it itself, would call it a
+    failure."""
+    report = progress.current()
     try:
-        yield from events
+        with report.heard_by(context.log.info):
+            yield from events
+            report.end_stage()
     except Exception as error:
         if (without_keys := redacted(error)) is error:
             raise

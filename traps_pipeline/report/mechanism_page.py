@@ -11,7 +11,7 @@ from traps_pipeline.storage.tables import Table
 
 PAIRS = 50  # a cell (docs/spec.md 8.2)
 STEERED_LAYERS = {"qwen3-vl-8b": 20, "gemma-4-e4b": 35, "llava-next-video-7b": 28}
-_FLAGS = ("own_best", "all_sample_best", "source_best")
+_FLAGS = ("own_best", "all_sample_best", "chosen")
 
 
 def published_probes() -> pd.DataFrame:

@@ -22,13 +22,9 @@ DatasetOrOverall = Annotated[str, "one of four, or overall"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricsRow:
+class MetricsRow(shared.CellRow):
     """A cell: one model, regime and run on one scope of a dataset."""
 
-    dataset: shared.CellDataset
-    model: shared.Model
-    regime: shared.Regime
-    run: shared.Run
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
     n_pairs: Annotated[int, "pairs in scope"]
     n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]

@@ -1,5 +1,6 @@
 """Columns that tables of several packages share: a type with its meaning in words, said once."""
 
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated
 
@@ -38,3 +39,13 @@ BenchmarkVersion = Annotated[
     str,
     "of the part of the benchmark that this row is from: release, or release+digest once corrected",
 ]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CellRow:
+    """The columns of a row that belongs to one cell: a dataset under one evaluation."""
+
+    dataset: CellDataset
+    model: Model
+    regime: Regime
+    run: Run

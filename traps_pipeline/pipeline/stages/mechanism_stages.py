@@ -165,7 +165,7 @@ probes = stage(
     PROBES,
     _make_probes,
     group=GROUP,
-    code="2",
+    code="3",
     parents=[
         of(hidden_states, by_extraction, need="some"),
         of(verdicts, ANSWERED, need="none"),

@@ -59,7 +59,7 @@ def probe_baselines(results: Results) -> Figure:
             sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
             ax.set_title(f"{plain(model)[:40]}, {_from_to(sides.min(), sides.max())} items a side", size=7.5)
             ax.set_ylabel("AUROC")
-        handles = [Line2D([], [], color=INK, marker="o", markersize=4, label="states, at the source’s own layer")]
+        handles = [Line2D([], [], color=INK, marker="o", markersize=4, label="states, layer chosen without the target")]
         handles += [
             Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=4, label=name)
             for (name, marker), colour in zip(_BASELINES.items(), COLOURS, strict=False)

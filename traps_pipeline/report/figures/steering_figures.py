@@ -67,8 +67,8 @@ def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
 
 def probe_curves(results: Results) -> Figure:
     """AUROC by layer of the twelve ordered pairs, with a row per model and a column per transfer type. The band shows
-    label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the source's own
-    layer."""
+    label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the layer chosen
+    without the target's labels."""
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
@@ -87,7 +87,7 @@ def probe_curves(results: Results) -> Figure:
             ax.set_xlabel("layer (0: embeddings)")
         axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
         shuffled = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
-        _legend(figure, _key("source’s own layer", "white"), shuffled)
+        _legend(figure, _key("layer chosen without the target", "white"), shuffled)
     return figure
 
 
@@ -103,7 +103,7 @@ def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
         style: dict[str, Any] = {"color": COLOUR[source], "marker": MARKER[target], "markersize": 3.2}
         line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": every}
         ax.plot(curve["layer"], curve["value"], **line)
-        chosen = curve.loc[curve["source_best"]]
+        chosen = curve.loc[curve["chosen"]]
         style |= {"markersize": 5, "markerfacecolor": "white", "linestyle": "none"}
         ax.plot(chosen["layer"], chosen["value"], **style)
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)

@@ -42,7 +42,7 @@ def probe_baselines(results: Results) -> list[PrintedTable]:
 
 
 def beside(results: Results) -> pd.DataFrame:
-    """One row per model and ordered pair of datasets, a dataset on itself among them: the probe at the source's own
+    """One row per model and ordered pair of datasets, a dataset on itself among them: the probe at the target's chosen
     layer, with its interval, and each baseline. Within a taxonomy all of them are fitted without the scored scenario
     (`held_out`), elsewhere on all of the source (`transfer`)."""
     import pandas as pd
@@ -51,13 +51,13 @@ def beside(results: Results) -> pd.DataFrame:
         [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
         columns=pd.Index(["source", "target", "analysis"]),
     )
-    probe = results.probes.loc[results.probes["source_best"].eq(True)]
+    probe = results.probes.loc[results.probes["chosen"].eq(True)]
     return _with_baselines(results, probe.merge(wanted, on=["source", "target", "analysis"]))
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
     """As `beside`, on the items that only look like voids, by probes of the datasets of their taxonomy."""
-    probe = results.probes.loc[results.probes["source_best"].eq(True) & results.probes["target"].isin([*WHAT])]
+    probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
 
@@ -92,8 +92,8 @@ _BASELINES = (
 )
 _SIDES = (Column("n_voids", "Voids", "count"), Column("n_controls", "Controls", "count"))
 _NOTES = (
-    "AUROC of the same protocol on other features than states; the layer is the source’s own, which uses no label of "
-    "a target",
+    "AUROC of the same protocol on other features than states; the layer is chosen on pairs of other datasets than "
+    "the target (probe_layers)",
     "output margin: log-odds that the first answer token begins an abstention; noise: random vectors as wide as "
     "states, mean ± deviation over draws, the floor of the split",
     "a probe shows understanding only as far as it is above the raw inputs, and a gap between states and output only "
@@ -316,7 +316,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
 
 def prompts(results: Results) -> pd.DataFrame:
     """One row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
-    prompts the AUROC of the probe (at the dataset's own layer, fitted without the scored scenario) and of the output
+    prompts the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario) and of the output
     margin; those of the best raw input and of noise; n_answered, the fewest voids that were answered under either
     prompt, n_voids and n_controls of the probe."""
     import pandas as pd
@@ -328,7 +328,7 @@ def prompts(results: Results) -> pd.DataFrame:
     table = table.reindex(columns=pd.Index(PROMPTING)).add_prefix("said_")
     table["change"] = table["said_guided"] - table["said_standard"]
     counted = {"n_answered": (plain, "n_voids")}
-    own = [results.prompted_probes.loc[results.prompted_probes["source_best"].eq(True)]]
+    own = [results.prompted_probes.loc[results.prompted_probes["chosen"].eq(True)]]
     own += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
     for name, rows in zip(("probe", "margin"), own, strict=True):
         rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]

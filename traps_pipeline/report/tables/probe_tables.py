@@ -1,5 +1,5 @@
-"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, nearest centroids, what is only hidden; each
-beside the best of the raw inputs, the output margin and the floor of noise."""
+"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, nearest centroids; beside the best of
+the raw inputs, the output margin and the floor of noise."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.mechanism.layer_choice import ROUNDING, layer_choice, pair_curves
 from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS, path_name
-from traps_pipeline.protocol.datasets import ANSWERABLE, transfer_type
+from traps_pipeline.protocol.datasets import SHORT, transfer_type
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables import probe_baselines
 from traps_pipeline.report.tables.control_reports import DRAWS, FEW_NOTE
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 
 def probes(results: Results) -> list[PrintedTable]:
     """Probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
-    probes' controls."""
+    layer that is chosen without the target's labels."""
     tables = [_transfer(results), _confabulated(results), _means(results), _within(results)]
-    return [*tables, _catch(results), _answerable(results)]
+    return [*tables, _layers(results), _catch(results)]
 
 
 APART = "not computed; held out: these datasets share no controls and no scenarios"
@@ -41,7 +42,8 @@ def _few_note(marks: Sequence[str]) -> list[str]:
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row per model and ordered pair: the paper's best layer, the source's own layer, and Cf->Cf at both layers."""
+    """One row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target, and
+    Cf->Cf at its own and at the best layer."""
     import pandas as pd
 
     pair_rows: list[dict[str, Any]] = []
@@ -52,14 +54,14 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
             transfer, held_out, cf, cf_held_out = (pair.loc[pair["analysis"] == name] for name in analyses)
             if not len(transfer):
                 continue
-            best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["source_best"]]
+            best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["chosen"]]
             at_best, own = cf.loc[cf["all_sample_best"] & cf["value"].notna()], cf.loc[cf["own_best"]]
             pair_rows.append(
                 {
                     **{"model": model, "source": source, "target": target, "path": path_name(source, target)},
                     "transfer_type": transfer_type(source, target),
                     **_at(best, "best", ("layer", "value", "low", "high", "n_voids", "n_controls")),
-                    **_at(chosen, "source", ("layer", "value")),
+                    **_at(chosen, "chosen", ("layer", "value", "low", "high")),
                     **_at(held_out.loc[held_out["all_sample_best"]], "held_out", ("value",)),
                     **_at(at_best, "cf", ("layer", "value", "low", "high", "n_voids", "n_controls")),
                     **_at(own, "cf_own", ("layer", "value")),
@@ -97,13 +99,13 @@ def _transfer(results: Results) -> PrintedTable:
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"),
         Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
-        Column("source_layer", "Source’s layer", "count"), Column("source_value", "AUROC there", "fraction"),
+        Column("chosen_layer", "Chosen layer", "count"), Column("chosen_value", "AUROC there", "fraction"),
         *_held_out(results), *probe_baselines.columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
-        "best layer: the highest AUROC on the target itself, as in the paper; the source’s layer is the highest of its "
-        "own grouped cross-validation, which uses no label of a target",
+        "best layer: the highest AUROC on the target itself, as in the paper; chosen layer: where the other datasets’ "
+        "probes carry over best to each other, which uses no pair of the target (table of layers)",
         *_shared_controls(results),
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
         *probe_baselines.notes(results),
@@ -146,7 +148,7 @@ def _confabulated(results: Results) -> PrintedTable:
 def _means(results: Results) -> PrintedTable:
     rows = _pairs(results)
     if len(rows):
-        figures = ["best_value", "source_value", "held_out_value", "cf_value", "cf_own_value", "cf_held_out_value"]
+        figures = ["best_value", "chosen_value", "held_out_value", "cf_value", "cf_own_value", "cf_held_out_value"]
         figures += [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
         figures += ["held_noise", "cf_held_noise"]
         grouped = rows.groupby(["model", "transfer_type"], sort=False)
@@ -158,7 +160,7 @@ def _means(results: Results) -> PrintedTable:
         rows = rows.assign(cf_mark=few(rows, "cf_n_voids", "cf_n_controls"))
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
-        Column("source_value", "Source’s layer", "fraction", mark="mark"),
+        Column("chosen_value", "Chosen layer", "fraction", mark="mark"),
         *_held_out(results), *probe_baselines.columns(results),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
         Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
@@ -207,7 +209,7 @@ def _shared_controls(results: Results) -> list[str]:
     return notes + [held] * results.is_study
 
 
-# --- within a dataset, centroids, what is only hidden -----------------------------------------------------------------
+# --- within a dataset, layers, centroids ------------------------------------------------------------------------------
 
 
 def _within(results: Results) -> PrintedTable:
@@ -216,7 +218,7 @@ def _within(results: Results) -> PrintedTable:
     table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
     best = rows.loc[(rows["analysis"] == "within") & rows["own_best"], ["model", "source", "layer", "value"]]
     table = table.merge(best, on=["model", "source"], how="left")
-    itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["source_best"]]
+    itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
     itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
     table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
     table = table.merge(probe_baselines.against(results, "held_out"), on=probe_baselines.KEYS, how="left")
@@ -308,37 +310,43 @@ def _caught_beside(results: Results) -> pd.DataFrame:
     return table
 
 
-def _answerable(results: Results) -> PrintedTable:
-    rows = results.probes
-    own = (rows["target"] == ANSWERABLE) & rows["source_best"].eq(True)
-    table: pd.DataFrame | None = None
-    for analysis in ("answerable_void", "answerable_control"):
-        part = rows.loc[
-            own & (rows["analysis"] == analysis), [*probe_baselines.KEYS, "layer", "value", "n_voids", "n_controls"]
-        ]
-        part = part.assign(mark=few(part, "n_voids", "n_controls")).merge(
-            probe_baselines.against(results, analysis, f"{analysis}_"), on=probe_baselines.KEYS, how="left"
-        )
-        part = part.rename(columns={name: f"{analysis}_{name}" for name in ("value", "mark", "n_voids", "n_controls")})
-        table = part if table is None else table.merge(part, on=[*probe_baselines.KEYS, "layer"], how="outer")
-    assert table is not None
-    table = table.assign(dataset=short_names(table["source"]))
+def _layers(results: Results) -> PrintedTable:
+    table, notes = layer_curves(results.probes)
     columns = [
-        MODEL, Column("dataset", "Source"), Column("layer", "Source’s layer", "count"),
-        Column("answerable_void_value", "Unanswerable against answerable", "fraction", mark="answerable_void_mark"),
-        *probe_baselines.columns(results, "answerable_void_"),
-        Column("answerable_control_value", "Answerable void against control", "fraction",
-               mark="answerable_control_mark"),
-        *probe_baselines.columns(results, "answerable_control_", "Second: "),
-        Column("answerable_void_n_controls", "Answerable", "count"),
-        Column("answerable_void_n_voids", "Voids", "count"),
-        Column("answerable_control_n_controls", "Controls", "count"),
+        MODEL, Column("layer", "Layer", "count"),
+        *(Column(name, f"without {short}", "fraction", mark=f"{name}_mark") for name, short in SHORT.items()
+          if name in table),
+        Column("n_at_top", "Own maxima", "count"),
     ]  # fmt: skip
     notes = [
-        "answerable: void clips of occlusion with a question that they answer. First column: the same clips with both "
-        "questions; 0.5 if a probe detects a hidden object, 1 if it detects an unknowable answer. Second: the reverse",
-        *probe_baselines.notes(results),
-        *_few_note([*table["answerable_void_mark"].dropna(), *table["answerable_control_mark"].dropna()]),
+        "without a dataset: mean AUROC of the probes of the other datasets on each other, those of one taxonomy fitted "
+        "without the scored scenario; ← the layer at which that dataset is read, the middle one of equal ones",
+        "own maxima: datasets whose own cross-validation is highest at this layer; a maximum that several layers share "
+        "chooses none of them",
+        *notes,
     ]
-    absent = why(results) if results.is_study else "the paper has no such control"
-    return PrintedTable("probe_answerable", "Hidden, or unknowable", table, columns, notes, absent, deviation=DRAWS)
+    absent = why(results) if results.is_study else "the paper prints no curves"
+    return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, absent)
+
+
+def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Return one row per model and layer: for each dataset the mean AUROC of pairs of the others, marked where it is
+    chosen, and how many datasets have the maximum of their own cross-validation there; and a note on ties a model."""
+    import pandas as pd
+
+    parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()
+    for model, of in rows.groupby("model", sort=False):
+        curves = pair_curves({str(name): value for name, value in row.items()} for row in of.to_dict("records"))
+        within = of.loc[of["analysis"] == "within", ["source", "layer", "value"]]
+        if not curves or not len(within):
+            continue
+        part = within.assign(top=within["value"] >= within.groupby("source")["value"].transform("max") - ROUNDING)
+        part = part.groupby("layer")["top"].sum().rename("n_at_top").to_frame()
+        choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within["source"])}
+        for name, choice in choices.items():
+            part[name] = pd.Series(choice.curve)
+            part[f"{name}_mark"] = ["←" if layer == choice.layer else "" for layer in part.index]
+        parts.append(part.reset_index().assign(model=model))
+        tied = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
+        notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tied)}")
+    return pd.concat(parts, ignore_index=True), notes

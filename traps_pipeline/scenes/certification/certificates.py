@@ -28,7 +28,7 @@ from traps_pipeline.scenes.certification.evidence import (
     VoidKind,
 )
 from traps_pipeline.scenes.parts.look import fineness
-from traps_pipeline.scenes.parts.wording import FAR_COLOUR, false_premises, refutation
+from traps_pipeline.scenes.parts.wording import FAR_COLOUR, false_premises, none_as_answer, refutation
 from traps_pipeline.scenes.physics.flexes import flexes, is_carrier
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.physics.simulate import swept_points
@@ -744,6 +744,7 @@ def _words(pair: Pair) -> Evidence:
         "ill_posed_for": refutation(taxonomy, asked, inventory),
         "question_refuted": refutation(taxonomy, pair.claim.question, inventory),
         "premises": 1 if taxonomy == "occlusion" else len(false_premises(asked, inventory, near=True)),
+        "true_answer": None if taxonomy == "occlusion" else none_as_answer(asked),
     }
 
 
@@ -752,6 +753,8 @@ def _judge_words(e: Evidence, claim: Claim) -> Judged:
         yield f"nothing shows that {claim.ill_posed_question!r} has no answer"
     if e["premises"] > 1:
         yield f"{claim.ill_posed_question!r} presumes {e['premises']} things that are not so; one is enough"
+    if e["true_answer"] is not None:
+        yield f"{claim.ill_posed_question!r} has a true answer: {e['true_answer']}"
     if e["question_refuted"] is not None:
         yield f"the question {claim.question!r} reads as ill-posed: {e['question_refuted']}"
 
@@ -760,10 +763,12 @@ WORDS = Certificate(
     name="words",
     about="words",
     promises="the ill-posed question asks what no video shows (occlusion) or presumes one thing that the inventory "
-    f"refutes (chaotic; a colour that it presumes is {FAR_COLOUR:.0f} or more in CIELAB from all in view); the "
-    "well-posed one does neither",
+    f"refutes (chaotic; a colour that it presumes is {FAR_COLOUR:.0f} or more in CIELAB from all in view), and zero, "
+    "never, nobody, nothing or no is no true answer to that; the well-posed question does neither",
     does_not_promise="",
-    numbers=tuple(Number(name, kept=False) for name in ("ill_posed_for", "question_refuted", "premises")),
+    numbers=tuple(
+        Number(name, kept=False) for name in ("ill_posed_for", "question_refuted", "premises", "true_answer")
+    ),
     measure=_words,
     judge=_judge_words,
 )

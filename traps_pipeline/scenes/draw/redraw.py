@@ -8,6 +8,7 @@ it then runs `traps certify`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +17,18 @@ import numpy as np
 
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of
+from traps_pipeline.scenes.certification.certificates import WORDS, certificates_for, pair_of
 from traps_pipeline.scenes.draw.resolve import Resolved, plain
-from traps_pipeline.scenes.draw.sample import Draw, kind_of, load_tallies, record_line, save_tallies, take_out, try_draw
+from traps_pipeline.scenes.draw.sample import (
+    Draw,
+    ill_posed_for,
+    kind_of,
+    load_tallies,
+    record_line,
+    save_tallies,
+    take_out,
+    try_draw,
+)
 from traps_pipeline.scenes.family_registry import family_digest, get_family
 from traps_pipeline.scenes.parts.look import Look, look_of_draw
 from traps_pipeline.scenes.physics.kit import params_to_dict
@@ -53,6 +63,25 @@ def relook_family(
     looks = get_family(name).looks
     assert set(looks) <= set(STILL), f"{name}: looks in {', '.join(looks)}, of which some move the camera"
     return _rewritten(released, name, _relooked, workers, report)
+
+
+def reask_family(released: Path, name: str) -> list[str]:
+    """Draw a new ill-posed question for each record of a family whose own loses the certificate `words`; return their
+    ids. Clips, worlds and all else stay."""
+    seed, changed = load_tallies(released)[name].seed, list[str]()
+    lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+    records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
+    texts = Counter(spec.ill_posed_question for spec in records.values())
+    for spec in list(records.values()):
+        pair = pair_of(spec, *(np.empty((0, 0)),) * 2)  # the words are measured without a trajectory
+        if WORDS.failure(WORDS.measured(pair), pair.claim) is not None:
+            texts[spec.ill_posed_question] -= 1
+            question = ill_posed_for(spec, seed, texts, len(records))
+            texts[question] += 1
+            records[spec.scenario_id] = spec.model_copy(update={"ill_posed_question": question})
+            changed.append(spec.scenario_id)
+    write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
+    return changed
 
 
 def _rewritten(

@@ -273,13 +273,19 @@ def try_draw(draw: Draw) -> Resolved | str:
 
 def _named(family: Family, found: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
     """The scenario with its id and an ill-posed question that its family still has room for."""
-    physics = family.physics
-    inventory = family.build(family.params_from(found.spec.params), physics).inventory
-    most = ill_posed_quota(family.taxonomy, count)
-    rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, place])
-    question = draw_ill_posed(family.taxonomy, inventory, rng, lambda text: texts[text] < most)
-    names = {"scenario_id": f"{family.name}-{place:04d}", "ill_posed_question": question}
-    return Resolved(found.spec.model_copy(update=names), found.qpos, found.twin)
+    named = found.spec.model_copy(update={"scenario_id": f"{family.name}-{place:04d}"})
+    question = ill_posed_for(named, draw.seed, texts, count)
+    return Resolved(named.model_copy(update={"ill_posed_question": question}), found.qpos, found.twin)
+
+
+def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -> str:
+    """Draw the ill-posed question of a record that has its id. seed: its family's. texts: questions of the family's
+    other records, `count` in all. Raises ValueError when all questions are taken."""
+    family = get_family(spec.family)
+    inventory = family.build(family.params_from(spec.params), family.physics).inventory
+    most, place = ill_posed_quota(spec.taxonomy, count), int(spec.scenario_id.rpartition("-")[2])
+    rng = np.random.default_rng([seed, *spec.family.encode(), spec.seed, place])
+    return draw_ill_posed(spec.taxonomy, inventory, rng, lambda text: texts[text] < most)
 
 
 def simulated_answer(family: Family, params: Any) -> str:

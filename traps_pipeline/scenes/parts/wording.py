@@ -154,26 +154,30 @@ ABSENT_OBJECTS = (
     "propeller",
 )
 # What colours do not have, whatever the scene shows.
-NO_QUALITY_OF_A_COLOUR = r"\b(weight|mass|price|sound|decibels|temperature|speed|weigh|loud|cost)\b.*\bcolou?r\b"
+NO_QUALITY_OF_A_COLOUR = r"\b(weight|mass|price|sound|decibels|temperature|speed|weigh|loud|cost|age)\b.*\bcolou?r\b"
+# Each asks for something that the thing would have if it were there: none of them is truly answered by "none".
 _FALSE_PREMISES = (
     "What material is the {absent} made of?",
-    "How often does the {object} hit the {absent}?",
     "What colour is the {absent}?",
     "Is the {absent} to the left or to the right of the {object}?",
-    "How far does the {absent} travel?",
-    "How many {absent}s does the {object} touch?",
-    "When does the {object} pass the {absent}?",
-    "What is written on the {absent}?",
-    "Does the {absent} move before or after the {object}?",
+    "Is the {absent} in the left or in the right half of the picture?",
+    "Is the {absent} larger or smaller than the {object}?",
     "Where does the {colour} {object} end up?",
-    "How many times does the {colour} {object} turn over?",
-    "What does the {colour} {object} hit first?",
+    "Is the {colour} {object} in the left or in the right half of the picture at the end?",
     "Which way does the {present} arrow point?",
-    "How many {present} stripes does the {object} have?",
+    "What colour is the stripe on the {object}?",
+    "Is the stripe on the {object} thick or thin?",
     "What is the weight of the colour {present}?",
-    "How loud is the colour {present}, in decibels?",
     "What is the temperature of the colour {present}?",
-    "What does the colour {present} cost?",
+    "What is the age of the colour {present} in years?",
+)
+# Words by which a question may be answered truly though nothing that it presumes is there -> that answer.
+_TRULY_NONE = (
+    (r"^how (many|often|much|far|long|fast|loud|high|wide)\b", "zero"),
+    (r"^when\b|\b(moves?|turns?|travels?)\b", "never"),
+    (r"^who\b", "nobody"),
+    (r"\b(hits?|touch(es)?|pass(es)?|written|costs?|price)\b", "nothing"),
+    (r"^(is|are|was|were|do|does|did|has|have|can|will)\b(?!.* or )", "no"),
 )
 _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
@@ -199,6 +203,13 @@ def false_premises(question: str, inventory: Inventory, *, near: bool = False) -
 def false_premise(question: str, inventory: Inventory) -> str | None:
     """What the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
     return next(iter(false_premises(question, inventory)), None)
+
+
+def none_as_answer(question: str) -> str | None:
+    """Return the answer (zero, never, nobody, nothing, no) that denies a false premise and is true; None if there is
+    none. "How many windmills does the ball touch?" is answered by zero, "What colour is the windmill?" by nothing."""
+    text = question.lower()
+    return next((answer for words, answer in _TRULY_NONE if re.search(words, text)), None)
 
 
 def is_far(colour: str, present: Sequence[str]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.workers import run_in_order
 
-OPENGL = ("MUJOCO_GL", "PYOPENGL_PLATFORM")  # variables that choose what draws
+_OPENGL = re.compile(r"MUJOCO_|PYOPENGL_|MESA_|GALLIUM_|LIBGL_|LP_NATIVE|EGL_|__E?GL|LD_LIBRARY_PATH$|LD_PRELOAD$")
 
 
 def draw_frame() -> str:
@@ -36,8 +37,13 @@ def draw_frame() -> str:
     return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, {version}, one frame drawn ({red} red pixels of the ball)"
 
 
+def opengl_variables() -> dict[str, str]:
+    """Return the environment's variables that choose what draws, and how: of MuJoCo, PyOpenGL, Mesa and the loader."""
+    return {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
+
+
 def _unusable(reason: str) -> str:
-    chosen = ", ".join(f"{name}={os.environ[name]}" for name in OPENGL if name in os.environ)
+    chosen = ", ".join(f"{name}={value[:60]}" for name, value in opengl_variables().items())
     return (
         f"this machine cannot render clips with {chosen} ({' '.join(reason.split())[:300]}): unset these variables "
         "and, on Debian, apt-get install libosmesa6"
