@@ -93,9 +93,15 @@ def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
 
 def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout, demo_output: str) -> None:
     assert "3456 answers asked (0 from the ledger)\n15552 votes asked (0 from the ledger)\n" in demo_output
-    report = demo.workspace / "reports" / "report.html"
-    assert f"report {report}" in demo_output.splitlines()
-    assert report.stat().st_size > 1000
+    reports = demo.workspace / "reports"
+    for kind, page in (("report", reports / "report.html"), ("explorer", reports / "index.html")):
+        assert f"{kind} {page}" in demo_output.splitlines()
+        assert page.stat().st_size > 1000
+
+
+def test_the_pages_of_the_demo_are_few_and_small(demo: Checkout) -> None:
+    files = [path for path in (demo.workspace / "reports").rglob("*") if path.is_file()]
+    assert len(files) <= 30 and sum(path.stat().st_size for path in files) <= 6e6
 
 
 def test_a_second_run_asks_and_renders_nothing(demo_study: Checkout) -> None:

@@ -23,7 +23,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.terminal import finalized
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.explorer.answers import StudyAnswers, study_answers
-from traps_pipeline.explorer.scenario_words import certificate_phrases, intervention
+from traps_pipeline.explorer.scenario_words import certificate_phrases, closes_frame, intervention
 from traps_pipeline.explorer.scripts import data_script, parquet_text
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
@@ -34,6 +34,7 @@ from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.scoring.analyses import REASONING_PAIRS
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
@@ -46,8 +47,9 @@ INDEX, REPORT, SCRIPT, MANIFEST = "index.html", "report.html", "explorer.js", "s
 DATA, CLIPS = "data", "clips"
 LIBRARY = WEB / "vendor" / "parquet.js"
 _SOURCES = (
-    *("dom.js", "numbers.js", "store.js", "outcomes.js", "parts.js"),
-    *("leaderboard.js", "model.js", "matrix.js", "answers.js", "player.js", "pair.js", "compare.js", "main.js"),
+    *("dom.js", "keys.js", "search.js", "download.js", "numbers.js", "store.js", "outcomes.js", "parts.js"),
+    *("leaderboard.js", "landscape.js", "model.js", "matrix.js", "answers.js", "player.js", "pair.js", "compare.js"),
+    *("cases.js", "scenes.js", "main.js"),
 )
 _ITEM_COLUMNS = (
     *("dataset", "scenario_id", "pair_id", "side", "category", "family", "sub_scenario", "question", "ground_truth"),
@@ -207,6 +209,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "published": _records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,
+        "reasoning_pairs": [*map(list, REASONING_PAIRS)],
     }
 
 
@@ -238,9 +241,15 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "twin_answer": twin["ground_truth"],
                 "twin_clip": of_twin["path"] if of_twin else None,
                 "fps": of_control["fps"] if of_control else None,
+                "shown_at": _seconds(closes_frame(spec), of_control),
             }
         )
     return rows
+
+
+def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None:
+    """The last moment at which a control shows its outcome; null where that is its end."""
+    return None if closes is None or clip is None else (closes - 0.5) / clip["fps"]
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
