@@ -22,7 +22,7 @@ MECHANISM = {
     "models": {"tiny": {"steering": 3, "centroid": 4}},
     "prompts": ["standard"],
     "probes": {"folds": 2, "resamples": 100},
-    "patching": {"pairs": 2},
+    "patching": {"pairs": 2, "exact": 6, "stride": 1},
     "steering": {
         **{"alphas": [5], "pairs": 2, "well_posed_pairs": 4, "ill_posed_pairs": 4, "max_new_tokens": 4},
         **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "gaps": [1], "signs": ["minus"]},

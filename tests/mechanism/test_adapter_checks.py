@@ -58,7 +58,7 @@ def rounded_features(patch: pytest.MonkeyPatch) -> None:
 
 
 def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(patching_effects, "_patch_arguments", lambda _, __, ___, ____, args, kwargs: (args, kwargs))
+    patch.setattr(patching_effects, "_behind", lambda _, __: None)
 
 
 def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:

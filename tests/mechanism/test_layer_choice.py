@@ -53,7 +53,7 @@ def test_the_curve_and_its_ties_are_printed(saturated: pd.DataFrame) -> None:
     assert table["layer"].tolist() == [*range(LAYERS)] and table["n_at_top"].tolist() == [0, 4, 4, 4, 4, 4]
     at = table.set_index("layer")
     for dataset in DATASETS:
-        assert at[f"{dataset}_mark"].to_dict() == {layer: "←" if layer == PEAK else "" for layer in range(LAYERS)}
+        assert at[f"{dataset}_mark"].to_dict() == {layer: "*" if layer == PEAK else "" for layer in range(LAYERS)}
         assert at[dataset].idxmax() == PEAK
     assert notes == ["m: layers with the highest mean, by the dataset left out: oc 1, oc_ip 1, ch 1, ch_ip 1"]
 

@@ -17,9 +17,13 @@ import torch
 from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
+from traps_pipeline.mechanism.baselines import output_margins
 from traps_pipeline.mechanism.control_rows import GateRow
-from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS
-from traps_pipeline.mechanism.gating import UNTRAINED, gate_rows
+from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, decide
+from traps_pipeline.mechanism.gating import UNTRAINED, gate_items, gate_rows, gate_table, read_states
+from traps_pipeline.mechanism.item_scores import item_score_rows
+from traps_pipeline.mechanism.lens import lens_rows
+from traps_pipeline.mechanism.margin import begins_abstention
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probing import ProbeRun
@@ -230,3 +234,44 @@ def test_states_under_the_benchmarks_own_prompt_have_other_keys_and_are_the_libr
         for layer in range(model.n_layers):  # the library's last one is normed
             assert np.array_equal(states.read("chaotic", layer)[place], library[layer][0, -1].numpy())
         assert np.array_equal(states.read("chaotic", "normed")[place], library[-1][0, -1].numpy())
+
+
+# --- states and output, item by item and layer by layer ---------------------------------------------------------------
+
+
+def test_every_item_has_a_score_of_states_a_margin_and_its_verdict(study: Workspace, entry: ModelEntry) -> None:
+    states = StoredStates.of(study, STANDARD)
+    rows = pd.DataFrame(item_score_rows(study, entry, states))
+    assert {*rows["item_id"]} == {*states.items.loc[states.items["dataset"].isin(DATASETS), "item_id"]}
+    verdicts = study.tables.read_all(VERDICTS).set_index("item_id")["abstained"]
+    assert (rows.set_index("item_id")["abstained_standard"] == verdicts.loc[rows["item_id"]]).all()
+    assert rows["abstained_guided"].isna().all()  # not asked
+    for dataset, of in rows.groupby("dataset"):
+        margins = output_margins(entry, states, [str(dataset)])[str(dataset)][:, 0]
+        assert of["margin"].to_numpy(float) == pytest.approx(margins)
+        (layer,) = {*of["layer"]}
+        table, features = gate_table(states), read_states(states, EVERY, layer)
+        own = decide(gate_items(table, features, shuffled=False, seed=0), f"one:{dataset}", str(dataset),
+                     folds=study.mechanism.probes.folds, seed=study.mechanism.seed, false_abs=0.05)  # fmt: skip
+        assert of["own"].to_numpy(float) == pytest.approx(own.score - own.threshold["mid"])
+
+
+def test_the_lens_is_the_models_norm_and_head_on_each_layer_and_ends_at_the_output_margin(
+    study: Workspace, entry: ModelEntry
+) -> None:
+    states, model = StoredStates.of(study, STANDARD), load_local_model(entry, inside=True)
+    rows = pd.DataFrame(lens_rows(study, entry, states)).set_index(["dataset", "layer"])
+    assert len(rows) == len(DATASETS) * states.n_layers
+    void = (states.dataset("chaotic")["side"] == "void").to_numpy()
+    margins = output_margins(entry, states, ["chaotic"])["chaotic"][:, 0]
+    last = rows.loc[("chaotic", model.n_layers)]
+    assert (last["voids"], last["controls"]) == pytest.approx((margins[void].mean(), margins[~void].mean()), abs=1e-4)
+    with torch.no_grad():
+        raw = torch.from_numpy(states.read("chaotic", 2))
+        logits = model.network.lm_head(model.network.model.language_model.norm(raw))
+        logits[:, model.network.generation_config.suppress_tokens] = -torch.inf  # pictures' tokens are never answers
+        chance = logits.softmax(-1)
+    begins = [t for t in range(chance.shape[1]) if begins_abstention(model.processor.tokenizer.decode([t]))]
+    told = chance[:, begins].sum(1)
+    odds = torch.log(told / (1 - told)).numpy()
+    assert rows.loc[("chaotic", 2), "voids"] == pytest.approx(odds[void].mean(), abs=1e-3)

@@ -1,24 +1,28 @@
-"""The patching stage: its ratio, interval and flips worked out by hand, which tokens count as changed, and where the
-nulls of a pair come from."""
+"""The patching stage: its ratio, interval and flips worked out by hand, which cells are patched, which tokens count as
+changed, where the nulls of a pair come from, and what a killed run leaves."""
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import time
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
+from tests.conftest import ROOT
 from tests.local_models import SYSTEM, ask, clip, model
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.mechanism import patched
 from traps_pipeline.mechanism.directions import seeded_order
-from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.patched import Side, _groups, _summed, effect_of, patching_rows
+from traps_pipeline.mechanism.patched import Side, best_cells, effect_of, groups_of, patching_rows, summed
 from traps_pipeline.mechanism.patching_effects import Patch, Recorded, record
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
@@ -29,6 +33,7 @@ from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import encode
 
@@ -65,9 +70,9 @@ def test_sides_that_do_not_differ_have_no_effect() -> None:
 
 
 def change(scenario: str, before: float, after: float, there: float, **other: Any) -> dict[str, Any]:
-    about = {"scenario": scenario, "into": "control", "source": "pair", "left_out": False}
+    about = {"scenario": scenario, "into": "control", "source": "pair"}
     about |= {"site": "residual", "layer": 1, "group": "stamps", "tokens": 4}
-    return about | {"before": before, "after": after, "there": there} | other
+    return about | {"before": before, "change": after - before, "there": there} | other
 
 
 def left_out(scenario: str, into: str, source: str) -> dict[str, Any]:
@@ -75,26 +80,34 @@ def left_out(scenario: str, into: str, source: str) -> dict[str, Any]:
 
 
 def test_rows_count_flips_among_pairs_that_could_flip_and_say_which_were_left_out() -> None:
-    changes = [
+    estimates = [
+        change("a", -2.0, 1.0, 2.0),
+        change("b", -2.0, -1.5, 2.0),
+        change("c", -2.0, -2.5, -3.0),
+        change("a", -2.0, -1.0, 2.0, group="last"),
+        left_out("d", "control", "pair"),
+        left_out("e", "control", "pair"),
+    ]
+    patches = [
         change("a", -2.0, 1.0, 2.0),  # flips, and could
         change("b", -2.0, -1.0, 2.0, tokens=8),  # could, and does not
         change("c", -2.0, 1.0, -3.0, tokens=6),  # flips, though both sides say the same
-        change("a", -2.0, -2.0, 2.0, group="last"),
-        left_out("d", "control", "pair"),
-        left_out("e", "control", "pair"),
         left_out("a", "void", "other scenario"),
         left_out("d", "control", "other scenario"),
         change("a", -2.0, 0.0, 2.0, source="other scenario"),
     ]
-    rows = {(row.into, row.source, row.group): row for row in _summed(pd.DataFrame(changes), TINY, "chaotic", 0)}
+    rows = {(row.into, row.source, row.group): row for row in summed(estimates, patches, TINY, "chaotic", 0)}
     assert set(rows) == {
         ("control", "pair", "stamps"), ("control", "pair", "last"), ("control", "other scenario", "stamps"),
         ("void", "other scenario", "all"),
     }  # fmt: skip
     stamps = rows["control", "pair", "stamps"]
     assert stamps.effect == pytest.approx((3 + 1 + 3) / (4 + 4 - 1))
+    assert stamps.attributed == pytest.approx((3 + 0.5 - 0.5) / (4 + 4 - 1))
     assert (stamps.flips, stamps.n_flippable, stamps.n, stamps.n_left_out) == (0.5, 2, 3, 2)
     assert stamps.tokens == 6 and (stamps.site, stamps.layer) == ("residual", 1)
+    last = rows["control", "pair", "last"]  # estimated alone
+    assert (last.attributed, last.effect, last.flips, last.n) == (0.25, None, None, 1)
     null = rows["control", "other scenario", "stamps"]  # a margin of 0 is neither sign
     assert (null.effect, null.flips, null.n, null.n_left_out) == (0.5, 1.0, 1, 1)
     nothing = rows["void", "other scenario", "all"]
@@ -102,9 +115,23 @@ def test_rows_count_flips_among_pairs_that_could_flip_and_say_which_were_left_ou
     assert (nothing.n, nothing.n_flippable, nothing.n_left_out) == (0, 0, 1)
 
 
-def test_no_flips_are_told_where_no_pair_could_flip() -> None:
-    (row,) = _summed(pd.DataFrame([change("a", 1.0, -1.0, 2.0)]), TINY, "chaotic", 0)
+def test_no_flips_are_reported_where_no_pair_could_flip() -> None:
+    (row,) = summed([], [change("a", 1.0, -1.0, 2.0)], TINY, "chaotic", 0)
     assert row.effect == -2.0 and row.flips is None and row.n_flippable == 0
+
+
+def test_the_cells_with_the_largest_sums_of_estimates_are_patched_at_every_so_many_layers() -> None:
+    sizes = {("residual", 0, "all"): 9.0, ("residual", 2, "last"): -5.0, ("residual", 1, "last"): 8.0,
+             ("mlp", 4, "last"): 3.0, ("attention", 5, "all"): 2.0, ("mlp", 2, "all"): 1.0}  # fmt: skip
+    estimates = [
+        change(scenario, 0.0, share * size, 1.0, site=site, layer=layer, group=group)
+        for (site, layer, group), size in sizes.items()
+        for scenario, share in (("a", 1.5), ("b", -0.5))
+    ]
+    estimates.append(change("a", 0.0, 0.1, 1.0, into="void", layer=2))
+    chosen = best_cells(estimates, PatchingSettings(exact=3, stride=2), 5)
+    into_control = [("attention", 5, "all"), ("mlp", 4, "last"), ("residual", 2, "last")]  # 5: the last layer
+    assert chosen == [*(("control", *cell) for cell in into_control), ("void", "residual", 2, "stamps")]
 
 
 # --- which tokens changed ---------------------------------------------------------------------------------------------
@@ -117,7 +144,7 @@ def pocket() -> tuple[LocalModel, np.ndarray, np.ndarray]:
 
 def side(of: LocalModel, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTION) -> Side:
     prompt = of.prompt(SYSTEM, question, frames, times_s)
-    return Side(prompt, record(of, prompt, abstention_tokens(of)), spans(of, prompt, SYSTEM, question))
+    return Side(prompt, spans(of, prompt, SYSTEM, question))
 
 
 def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
@@ -130,7 +157,7 @@ def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
     assert n_visual == 4 * 48
     found = changed_tokens(one.prompt, other.prompt, one.parts["visual"])
     assert found is not None and np.flatnonzero(found[one.parts["visual"]]).tolist() == [2 * 48 + 2 * 8 + 4]
-    groups = _groups(one, other)
+    groups = groups_of(one, other)
     assert groups is not None
     visual = one.parts["visual"]
     assert np.flatnonzero(groups["changed"]).tolist() == np.flatnonzero(visual & found).tolist()
@@ -146,19 +173,19 @@ def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
 def test_where_pixels_do_not_come_token_by_token_all_visual_tokens_count_as_changed() -> None:
     of = model("llava-next-video")
     prompt = ask(of)
-    recorded, parts = record(of, prompt, abstention_tokens(of)), spans(of, prompt, SYSTEM, "Does it stop?")
+    parts = spans(of, prompt, SYSTEM, "Does it stop?")
     assert changed_tokens(prompt, prompt, parts["visual"]) is None
-    groups = _groups(Side(prompt, recorded, parts), Side(prompt, recorded, parts))
+    groups = groups_of(Side(prompt, parts), Side(prompt, parts))
     assert groups is not None and not groups["unchanged"].any()
     assert groups["changed"].tolist() == parts["visual"].tolist()
 
 
-def test_prompts_of_another_form_have_no_groups() -> None:
+def test_prompts_of_another_form_have_nogroups_of() -> None:
     of, frames, times = pocket()
     one = side(of, frames, times)
-    assert _groups(one, side(of, frames, times, QUESTION.replace("left or right", "left, right or behind"))) is None
-    assert _groups(one, side(of, frames, times + 10)) is None  # stamps of more digits
-    assert _groups(one, side(of, frames, times, QUESTION.replace("left or right", "right or left"))) is not None
+    assert groups_of(one, side(of, frames, times, QUESTION.replace("left or right", "left, right or behind"))) is None
+    assert groups_of(one, side(of, frames, times + 10)) is None  # stamps of more digits
+    assert groups_of(one, side(of, frames, times, QUESTION.replace("left or right", "right or left"))) is not None
 
 
 # --- where nulls come from --------------------------------------------------------------------------------------------
@@ -167,7 +194,7 @@ def test_prompts_of_another_form_have_no_groups() -> None:
 @pytest.fixture
 def entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelEntry:
     made = tiny_entry(tmp_path / "checkpoint")
-    patching = {"patching": {"pairs": PAIRS, "sites": ["residual", "attention"]}}
+    patching = {"patching": {"pairs": PAIRS, "sites": ["residual", "attention"], "exact": 6, "stride": 1}}
     monkeypatch.setattr("tests.mechanism.study.SETTINGS", SETTINGS | patching)
     register(monkeypatch, made)
     return made
@@ -211,20 +238,20 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
 
     prompts: dict[int, tuple[str, str, str]] = {}
     kept: list[Recorded] = []
-    asked: list[tuple[tuple[str, str, str], tuple[str, str, str]]] = []
+    pairs: list[tuple[tuple[str, str, str], tuple[str, str, str]]] = []
 
-    def recording(of: LocalModel, prompt: Prompt, tokens: Sequence[int]) -> Recorded:
-        made = record(of, prompt, tokens)
-        kept.append(made)  # or another one might get its address
-        prompts[id(made)] = names[prompt.digest]
-        return made
+    def recording(of: LocalModel, prompt: Prompt, *rest: Any) -> Recorded:
+        recorded = record(of, prompt, *rest)
+        kept.append(recorded)  # or another one might get its address
+        prompts[id(recorded)] = names[prompt.digest]
+        return recorded
 
-    def told(_: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], __: Any) -> np.ndarray:
-        asked.append((prompts[id(target)], prompts[id(source)]))
-        return np.full(len(patches), float(asked[-1][0][1] != asked[-1][1][1]))  # 1 for frames of the other side
+    def changes(_: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], __: Any) -> np.ndarray:
+        pairs.append((prompts[id(target)], prompts[id(source)]))
+        return np.full(len(patches), float(pairs[-1][0][1] != pairs[-1][1][1]))  # 1 for frames of the other side
 
     monkeypatch.setattr(patched, "record", recording)
-    monkeypatch.setattr(patched, "patched_changes", told)
+    monkeypatch.setattr(patched, "patched_changes", changes)
     made = patching_rows(workspace, entry, TINY)
     order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)
     fitting = [name for name in order if name != "plinko-2"]
@@ -235,12 +262,68 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
         if name in fitting:
             following = fitting[(fitting.index(name) + 1) % len(fitting)]
             expected |= {(target, (following, towards, towards)), (target, (following, into, into))}
-    assert set(asked) == expected and len(asked) == len(expected)
-    for row in made:  # plinko-2 has no scenario of its form
+    assert set(pairs) == expected and len(pairs) == len(expected)
+    for row in (row for row in made if row.effect is not None):  # plinko-2 has no scenario of its form
         null = row.source in ("other scenario", "same side")
         assert (row.effect != 0) == (row.source in ("pair", "other scenario"))
         assert (row.n, row.n_left_out) == ((PAIRS - 1, 1) if null else (PAIRS, 0)), row
     assert {row.source for row in made} == {"pair", "other scenario", "same side", "other times"}
-    sites = {(row.source, row.site, row.layer > 0) for row in made}
-    residual = {(source, "residual", late) for source in patched.SOURCES for late in (False, True)}
-    assert sites == residual | {("pair", "attention", True)}  # nulls are of the residual stream alone
+    cells = [
+        {(row.into, row.site, row.layer, row.group) for row in made if row.source == source and row.effect is not None}
+        for source in patched.SOURCES
+    ]
+    assert len(cells[0]) == 2 * 6 and all(of_null == cells[0] for of_null in cells)
+
+
+# --- memory, and a killed run -----------------------------------------------------------------------------------------
+
+
+def size(recorded: Recorded) -> int:
+    return sum(states.numel() * states.element_size() for states in recorded.states.values())
+
+
+def test_states_of_two_passes_at_most_are_in_memory(
+    entry: ModelEntry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a pass of L blocks with residual stream and attention, (2 L + 1) T d numbers."""
+    workspace, of = make_study(tmp_path), load_local_model(entry, inside=True)
+    for dataset in patched.WELL_POSED:
+        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
+    alive, most, passes = weakref.WeakSet[Recorded](), 0, 0
+
+    def recording(*args: Any) -> Recorded:
+        nonlocal most, passes
+        recorded = record(*args)
+        alive.add(recorded)
+        passes += 1
+        most = max(most, sum(map(size, alive)) / (recorded.length * of.d_model * 4))
+        return recorded
+
+    monkeypatch.setattr(patched, "record", recording)
+    patching_rows(workspace, entry, TINY)
+    assert passes > 2 * 2 * PAIRS * 5 and 0 < most <= 2 * (2 * of.n_layers + 1)
+
+
+def test_a_killed_run_goes_on_behind_its_last_pair_and_gives_the_same_rows(entry: ModelEntry, tmp_path: Path) -> None:
+    described = tmp_path / "entry.json"
+    described.write_text(entry.model_dump_json(), "utf-8")
+    workspaces = [make_study(tmp_path / name) for name in ("killed", "alone")]
+    for workspace in workspaces:
+        for dataset in patched.WELL_POSED:
+            workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
+
+    def start(workspace: Workspace) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "tests.mechanism.patch_cell", str(workspace.root), str(described)]
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+    killed, written = start(workspaces[0]), workspaces[0].root / "patching"
+    while len([*written.rglob("*-patches-*.json")]) < 2:  # behind the estimates of a dataset, amid its patches
+        assert killed.poll() is None
+        time.sleep(0.02)
+    killed.kill()
+    killed.communicate()
+    (resumed, _), (alone, _) = (start(workspace).communicate() for workspace in workspaces)
+    again, whole = (json.loads(output.splitlines()[-1]) for output in (resumed, alone))
+    assert again["rows"] == whole["rows"] and whole["passes"] > 0
+    per_pair = whole["passes"] / (2 * PAIRS)  # half of the pairs were estimated, and two of them patched
+    assert again["passes"] <= whole["passes"] - per_pair

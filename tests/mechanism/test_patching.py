@@ -22,6 +22,8 @@ from traps_pipeline.mechanism.patching_effects import (
     Patch,
     Recorded,
     Site,
+    _margins,
+    attributed_changes,
     patched_changes,
     record,
     require_patchable,
@@ -190,6 +192,45 @@ def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(name: str) -> None
         expected = (torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0)).item()
         change = patched_changes(of, target, source, [Patch(site, layer, chosen.numpy())], tokens)[0]
         assert target.margin + change == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", PATCHABLE)
+def test_an_attribution_is_the_gradient_of_the_outcome_along_the_difference_of_states(name: str) -> None:
+    """Independent: the library's own pass, a block's output as a leaf, autograd; at positions of text behind the clip,
+    so that no side path is concerned."""
+    of, target, source, tokens, prompt, _ = pair(name)
+    block, leaves = of.network.get_decoder().layers[1], list[torch.Tensor]()
+
+    def as_leaf(_: object, __: object, output: torch.Tensor) -> torch.Tensor:
+        leaves.append(output.detach().clone().requires_grad_())
+        return leaves[0]
+
+    handle = block.register_forward_hook(as_leaf)
+    with torch.enable_grad():
+        logits = of.network(**prompt.inputs, use_cache=False).logits[0, -1].double()
+        handle.remove()
+        never = of.network.generation_config.suppress_tokens or []
+        rest = [t for t in range(len(logits)) if t not in tokens and t not in never]
+        (torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0)).backward()
+    slope = leaves[0].grad
+    assert slope is not None
+    expected = (slope[0] * (source.states["residual", 2] - target.states["residual", 2])).sum(dim=1).numpy()
+    estimated = attributed_changes(of, target, source, tokens)["residual", 2]
+    assert np.abs(expected[-9:-2]).max() > 1e-4
+    assert estimated[-9:-2] == pytest.approx(expected[-9:-2], rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", PATCHABLE)
+def test_an_attribution_of_all_positions_is_what_a_small_step_towards_the_source_does(name: str) -> None:
+    """Side paths included: deepstack features, shared keys and values, vectors of the token's own."""
+    of, target, source, tokens, *_ = pair(name)
+    share, nothing = 1e-2, torch.zeros(1, target.length)
+    estimated = attributed_changes(of, target, source, tokens)
+    for key in [("residual", layer) for layer in range(of.n_layers + 1)] + [("attention", 2), ("mlp", 1)]:
+        with torch.inference_mode():
+            ends = [_margins(of, target, source, {key: nothing + step}, 0, 1, tokens)[0] for step in (share, -share)]  # pyright: ignore[reportArgumentType]
+        stepped = float(ends[0].double() - ends[1].double()) / (2 * share)
+        assert estimated[key].sum() == pytest.approx(stepped, rel=0.05, abs=2e-3), key  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(

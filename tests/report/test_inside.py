@@ -14,6 +14,8 @@ import pytest
 
 from traps_pipeline.mechanism.control_rows import (
     GATE,
+    ITEM_SCORES,
+    LENS,
     PATCHING,
     PROBE_BASELINES,
     RISK_COVERAGE,
@@ -87,7 +89,35 @@ def curves() -> pd.DataFrame:
 def patching() -> pd.DataFrame:
     row = {"dataset": "chaotic", "into": "control", "site": "residual", "layer": 0, "group": "stamps"}
     row |= {"low": 0.9, "high": 1.1, "n": 6, "n_left_out": 1, "tokens": 6.0}
-    return frame(PATCHING, row | {"source": "pair", "effect": 0.99}, row | {"source": "same side", "effect": 0.01})
+    estimated = row | {"source": "pair", "group": "last", "attributed": 0.4, "effect": None}
+    own = row | {"source": "pair", "attributed": 0.8, "effect": 0.99}
+    return frame(PATCHING, own, estimated, row | {"source": "same side", "effect": 0.01})
+
+
+def item_scores() -> pd.DataFrame:
+    """Two voids, both answered: states rank them above both controls, the output between them."""
+    scored = (("void", 2.0, -3.0), ("void", 1.0, -1.0), ("control", -1.0, -2.0), ("control", -4.0, -4.0))
+    rows = [
+        {
+            "item_id": str(n),
+            "dataset": "chaotic",
+            "side": side,
+            "own": own,
+            "margin": margin,
+            "abstained_standard": False,
+        }
+        for n, (side, own, margin) in enumerate(scored)
+    ]
+    return frame(ITEM_SCORES, *rows)
+
+
+def lens() -> pd.DataFrame:
+    at = {("standard", 1): (-4, -5), ("guided", 1): (-4, -5), ("standard", 2): (-6, -9), ("guided", 2): (1, -8)}
+    rows = [
+        {"dataset": "chaotic", "prompt": prompt, "layer": layer, "voids": float(voids), "controls": float(controls)}
+        for (prompt, layer), (voids, controls) in at.items()
+    ]
+    return frame(LENS, *rows)
 
 
 def nulls() -> pd.DataFrame:
@@ -119,6 +149,8 @@ class Made(Results):
         "gate": lambda _: gate(),
         "risk_coverage": lambda _: curves(),
         "patching": lambda _: patching(),
+        "item_scores": lambda _: item_scores(),
+        "lens": lambda _: lens(),
         "nulls": lambda _: nulls(),
         "own_effects": lambda _: own_effects(effects()),
     }
@@ -182,12 +214,8 @@ def test_few_answers_are_marked_and_p_is_printed() -> None:
     assert any(note.startswith("†") for note in nulls.notes)
     (patched,) = patching_table(Made())
     (row,) = cells(patched)
-    assert (row["Indirect effect"], row["Same side"], row["Other times"], row["Left out"]) == (
-        "0.990 †",
-        "0.010",
-        "–",
-        "1",
-    )
+    printed = [row[name] for name in ("Estimate", "Indirect effect", "Same side", "Other times", "Left out")]
+    assert printed == ["0.800", "0.990 †", "0.010", "–", "1"]
 
 
 def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:
@@ -216,6 +244,30 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
     assert axes and all(ax.has_data() for ax in axes)  # no panel for a dataset that was not asked
 
 
+FINDINGS = {
+    "states_and_output": "m answered 2 voids under standard: its states put 2 of them among voids (and 0 of 2 "
+    "controls), its output 0; as an order of the sides, the AUROC of states is 1.00 and of output 0.75 (mean of "
+    "datasets).",
+    "lens": "In m the guided prompt moves the log-odds of abstaining by +7.0 on voids and +1.0 on controls at the last "
+    "layer, and by +0.0 and +0.0 one layer before (means over datasets).",
+    "probe_baselines": "m: states are above every raw input, the output margin and noise on 0 of 1 pairs of datasets, "
+    "and on 0 of 1 datasets themselves.",
+    "gate_arrows": "m under guided: a gate on states takes PECS from 0.45 to 0.64, the best other gate (question "
+    "words) to 0.64.",
+    "patching": "In m the difference of the output is carried by stamps tokens at the embeddings (0.99 of it) and by "
+    "stamps at the last layer (0.99).",
+    "doses_among_nulls": "m: void directions do more than 19 of 20 draws of every null in 1 of 1 cells, most of all ch "
+    "at 1 gap, where 80% more of 5 controls are abstained on.",
+}
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_a_lead_figure_says_what_it_shows_of_the_study_and_nothing_of_an_empty_one(name: str) -> None:
+    report = next(report for report in FIGURES if report.name == name)
+    assert report.finding(Made()) == FINDINGS[name]
+    assert report.note(Results()) == report.doc
+
+
 def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_its_controls_in_order(
     tmp_path: Path,
 ) -> None:
@@ -226,10 +278,10 @@ def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_i
         return [part.name for part in publish.report_parts(Sources(workspace)) if part.chapter == "figures"]
 
     order = [report.name for report in FIGURES]
-    assert shown(None) == order and order[:4] != [*INSIDE]
+    assert shown(None) == order and order[: len(INSIDE)] != [*INSIDE]
     inside = shown(MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}))
-    assert inside[:4] == ["probe_baselines", "gate_arrows", "patching", "doses_among_nulls"] == [*INSIDE]
-    assert inside[4:] == [name for name in order if name not in INSIDE]
+    assert inside[:3] == ["states_and_output", "lens", "probe_baselines"] == [*INSIDE[:3]]
+    assert inside == [*INSIDE, *(name for name in order if name not in INSIDE)]
 
 
 def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no_answer() -> None:
@@ -305,7 +357,10 @@ def test_the_page_says_below_a_figures_title_what_it_shows(tmp_path: Path) -> No
     assert figure_card(report, sources).why == "the experiment asks for no `patching`"
     sources.study = Made()
     page = report_html(frame(LEADERBOARD).astype(object), [figure_card(report, sources)])
-    assert f'<p class="shows">{report.doc}</p>' in page and "1 is the whole difference of the outcome" in report.doc
+    assert (
+        f'<p class="shows">{report.note(Made())}</p>' in page
+        and "1 is the whole difference of the outcome" in report.doc
+    )
 
 
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -31,6 +31,9 @@ from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import LocalModel
 
 THUMBNAIL = (32, 24)  # pixels of a frame that a baseline sees, width and height
 NOISE_DRAWS = 10
@@ -162,20 +165,27 @@ class NoMargin(TrapsError):
     """The output margin of these states cannot be read."""
 
 
-def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
-    """The output margin of every item under the prompt of the extraction, (n, 1): no pass is made, the stored state
-    that left the final norm goes through the model's head. Raises TrapsError for states that are means over tokens, and
-    for a model without a token that begins an abstention."""
-    from traps_pipeline.mechanism.margin import abstention_tokens, first_token_margins
+def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, list[int]]:
+    """Return the model whose head reads stored states, and the tokens with which it begins an abstention. Raises
+    NoMargin for states that are means over tokens, and for a model without such a token."""
+    from traps_pipeline.mechanism.margin import abstention_tokens
     from traps_pipeline.models.local.adapter import load_local_model
 
     if set(states.items["pooling"]) != {"last"}:
         raise NoMargin("states are means over tokens; set `pooling: last` to read the output margin")
     model = load_local_model(entry, inside=True)
     try:
-        tokens = abstention_tokens(model)
+        return model, abstention_tokens(model)
     except TrapsError as error:
         raise NoMargin(str(error)) from error
+
+
+def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
+    """Return the output margin of every item under the prompt of the extraction, (n, 1): no pass is made, the stored
+    state that left the final norm goes through the model's head. Raises NoMargin."""
+    from traps_pipeline.mechanism.margin import first_token_margins
+
+    model, tokens = margin_tokens(entry, states)
     return {
         name: first_token_margins(model, states.read(name, "normed"), tokens).double().numpy()[:, None]
         for name in datasets

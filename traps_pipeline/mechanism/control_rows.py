@@ -159,6 +159,45 @@ RISK_COVERAGE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
+class LensRow(Extracted):
+    """The margin of a dataset's states at a layer, through the model's final norm and head (logit lens)."""
+
+    dataset: shared.Dataset
+    layer: Annotated[int, "counted as in hidden_states; at the last one it is the output margin"]
+    voids: Annotated[float, "mean log-odds of voids that the first answer token begins an abstention"]
+    controls: Annotated[float, "the same of controls"]
+    auroc: Annotated[float, "of the log-odds, voids against controls"]
+    low: Annotated[float, "95 % interval, scenarios resampled"]
+    high: Annotated[float, "95 % interval, scenarios resampled"]
+    n_voids: Annotated[int, "void items"]
+    n_controls: Annotated[int, "control items"]
+
+
+LENS = Table("lens", LensRow, partition_by=("model", "prompt"), key=("dataset", "layer"))
+
+UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen the scenario"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ItemScoreRow(Extracted):
+    """What a model's states and its output say of one item, beside its verdicts."""
+
+    item_id: shared.ItemId
+    dataset: shared.Dataset
+    scenario_id: shared.ScenarioId
+    side: shared.Side
+    layer: Annotated[int, "at which the dataset is read, chosen on pairs of other datasets"]
+    own: Annotated[float | None, f"{UNSEEN} and was fitted on the item's own dataset"]
+    others: Annotated[float | None, f"{UNSEEN} and was fitted on the other datasets"]
+    margin: Annotated[float | None, "log-odds that the first answer token begins an abstention, under this prompt"]
+    abstained_standard: Annotated[bool | None, "verdict of run 1 under standard; null if undecided or not asked"]
+    abstained_guided: Annotated[bool | None, "verdict of run 1 under guided; null if undecided or not asked"]
+
+
+ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"), key=("item_id",))
+
+
+@dataclass(frozen=True, kw_only=True)
 class PatchingRow(Extracted):
     """The indirect effect of a group of positions at one site and layer, over the pairs of a dataset."""
 
@@ -176,8 +215,13 @@ class PatchingRow(Extracted):
         "system, stamps, changed (visual tokens whose pixels differ between the sides), unchanged, question, last, "
         "or all",
     ]
+    attributed: Annotated[
+        float | None, "estimate of `effect` to first order, from one backward pass a pair; null for nulls"
+    ]
     effect: Annotated[
-        float | None, "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it"
+        float | None,
+        "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it; null where no "
+        "patch was made",
     ]
     low: Annotated[float | None, "95 % interval, pairs resampled with one unseen"]
     high: Annotated[float | None, "95 % interval, pairs resampled with one unseen"]

@@ -95,7 +95,7 @@ def _each(
 ) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, Made]]:
     """Regime, its outcomes, features, source and decisions of every gate."""
     outcomes = {
-        regime: found for regime in PROMPTING if (found := _outcomes(workspace, entry.id, regime, states)) is not None
+        regime: found for regime in PROMPTING if (found := outcomes_of(workspace, entry.id, regime, states)) is not None
     }
     if not outcomes:
         raise TrapsError(
@@ -132,7 +132,7 @@ def _kinds(
 ) -> Iterator[Gates]:
     """States with every source; the controls with the sources that no single dataset's accidents decide."""
     names = [*dict.fromkeys(states.items["dataset"])]
-    yield Gates(STATES, {layer: _read(states, names, layer) for layer in sorted({*layers.values()})}, sources)
+    yield Gates(STATES, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, sources)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
@@ -142,14 +142,15 @@ def _kinds(
         yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
     except NoMargin as error:
         progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, {layer: _read(states, names, layer) for layer in sorted({*layers.values()})}, controls)
+    yield Gates(SHUFFLED, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, controls)
     if workspace.mechanism.gate.untrained:
         from traps_pipeline.mechanism.untrained import untrained_states
 
         yield Gates(UNTRAINED, {-1: untrained_states(workspace, entry, states, items)}, controls)
 
 
-def _read(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, np.ndarray]:
+def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, np.ndarray]:
+    """Return the states of some datasets at a layer, (n, d) each."""
     return {name: states.read(name, layer) for name in names}
 
 
@@ -183,7 +184,7 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
     return Items(table, values)
 
 
-def _outcomes(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
+def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
     """Outcomes by dataset, in the order of the states; None if the four datasets that have states have no verdicts.
     Items without verdicts (those that no model is asked) have undecided ones."""
     found: dict[str, Outcomes] = {}

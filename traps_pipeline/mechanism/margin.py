@@ -62,11 +62,10 @@ def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -
     import torch
 
     head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()
-    with torch.inference_mode():
-        states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
-        logits = head(states.to(model.device, model.network.dtype)).float()
-        cap = getattr(config, "final_logit_softcapping", None)
-        if cap:
-            logits = torch.tanh(logits / cap) * cap
-        never = model.network.generation_config.suppress_tokens or ()
-        return margin_of(logits, tokens, never).cpu()
+    states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
+    logits = head(states.to(model.device, model.network.dtype)).float()
+    cap = getattr(config, "final_logit_softcapping", None)
+    if cap:
+        logits = torch.tanh(logits / cap) * cap
+    never = model.network.generation_config.suppress_tokens or ()
+    return margin_of(logits, tokens, never).cpu()

@@ -1,24 +1,42 @@
-"""The patching stage: matched controls and voids of the well-posed datasets, group by group, layer by layer, with
-nulls; as rows of PATCHING."""
+"""The patching stage: matched controls and voids of the well-posed datasets, pair by pair, as rows of PATCHING.
+
+One backward pass a pair estimates the effect of every site, layer and group of positions; the cells with the largest
+estimates are then patched, beside nulls. What came of a pair is written before the next one begins, so that a stopped
+run goes on there. States of at most two passes are in memory at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import json
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
-from typing import TYPE_CHECKING, Any, cast
+from functools import lru_cache
+from heapq import nlargest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.base import progress
+from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.control_rows import PatchingRow
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.hidden_states import shown_times
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.patching_effects import Patch, Recorded, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.patching_effects import (
+    Patch,
+    Recorded,
+    attributed_changes,
+    patched_changes,
+    record,
+    require_patchable,
+)
+from traps_pipeline.mechanism.probing_versions import extraction_version
+from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
@@ -32,6 +50,7 @@ from traps_pipeline.scoring.bootstrap import (
     with_unseen,
 )
 from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -41,181 +60,273 @@ WELL_POSED = ("occlusion", "chaotic")  # their sides have the same question, and
 OWN, OTHER, SAME, TIMES = SOURCES = ("pair", "other scenario", "same side", "other times")
 GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 RESAMPLES = 1000
+PROMPTS_KEPT = 8  # with their pixels; the parts of all prompts are kept
+Row = dict[str, Any]
+Cell = tuple[str, Site, int, str]  # the side that is patched into, site, layer, group
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side of a pair: its prompt, its recorded pass, and the groups of its positions that do not depend on the
-    other side."""
+    """One side of a pair: its prompt, and the groups of its positions that do not depend on the other side."""
 
     prompt: Prompt
-    recorded: Recorded
     parts: Mapping[str, np.ndarray]
 
 
 def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[PatchingRow]:
-    """Rows of PATCHING of a model under a VQA prompt. Raises TrapsError for a model that cannot be patched."""
+    """Make the rows of PATCHING of a model under a VQA prompt. Raises TrapsError for a model that cannot be patched."""
     from traps_pipeline.models.local.adapter import load_local_model
 
     settings = workspace.mechanism.patching
     assert settings is not None, "an experiment without patching has no such stage"
     model = load_local_model(entry, inside=True)
     require_patchable(model)
-    tokens = abstention_tokens(model)
     rows: list[PatchingRow] = []
     for dataset in WELL_POSED:
-        items = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}) if _has(workspace, dataset) else None
-        if items is None:
-            continue
-        changes = _changes(workspace, entry, extraction, model, dataset, items, tokens)
-        rows += _summed(pd.DataFrame(changes), extraction, dataset, workspace.mechanism.seed)
+        if workspace.tables.state(PROBE_ITEMS, {"dataset": dataset}) is not None:
+            changes = Pairs(workspace, entry, extraction, dataset, model, settings).changes()
+            rows += summed(*changes, extraction, dataset, workspace.mechanism.seed)
     if not rows:
         raise TrapsError("patching: no pairs of a well-posed dataset; materialize probe_items first")
     return rows
 
 
-def _has(workspace: Workspace, dataset: str) -> bool:
-    return workspace.tables.state(PROBE_ITEMS, {"dataset": dataset}) is not None
+class Pairs:
+    """The pairs of a dataset that are patched, and the files that hold what came of each."""
 
+    def __init__(
+        self,
+        workspace: Workspace,
+        entry: ModelEntry,
+        extraction: Extraction,
+        dataset: str,
+        model: LocalModel,
+        settings: PatchingSettings,
+    ) -> None:
+        assert entry.media is not None, "local entries have media"
+        self._workspace, self._model, self._spec, self._settings = workspace, model, entry.media, settings
+        self._system, self._dataset = states_prompt(workspace.mechanism.system, extraction.prompt), dataset
+        self._tokens = abstention_tokens(model)
+        items, seed = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}), workspace.mechanism.seed
+        self._items = {(str(row["scenario_id"]), str(row["side"])): row for row in items.to_dict("records")}
+        self._names = seeded_order(sorted(set(items["scenario_id"])), seed)[: settings.pairs]
+        self._parts = dict[tuple[str, str, str], Mapping[str, np.ndarray]]()
+        self._side = lru_cache(PROMPTS_KEPT)(self._make_side)
+        asked = items[["item_id", "media_digest", "question"]].to_numpy(str).tolist()
+        made_of = [extraction_version(workspace, extraction), sorted(asked), self._names, settings.sites]
+        self._version = digest(made_of)[:16]
+        self._folder = workspace.root / "patching" / extraction.model / extraction.prompt / dataset
 
-def _changes(
-    workspace: Workspace,
-    entry: ModelEntry,
-    extraction: Extraction,
-    model: LocalModel,
-    dataset: str,
-    items: pd.DataFrame,
-    tokens: Sequence[int],
-) -> Iterator[dict[str, Any]]:
-    """One row per pair, direction, source and patch: the outcome before and after, and the other side's."""
-    settings = workspace.mechanism.patching
-    assert settings is not None and entry.media is not None
-    spec = entry.media
-    names = seeded_order(sorted(set(items["scenario_id"])), workspace.mechanism.seed)[: settings.pairs]
-    of = {(row["scenario_id"], row["side"]): row for row in items.to_dict("records")}
-    system = states_prompt(workspace.mechanism.system, extraction.prompt)
-    sides: dict[tuple[str, str], Side] = {}
+    def changes(self) -> tuple[list[Row], list[Row]]:
+        """Return what every patch from the other side does by estimate, and what the patches of `best_cells` and their
+        nulls do: a row for each pair, direction, source and cell."""
+        kept = set[Path]()
+        estimates = self._each("estimates", self._estimates, kept)
+        best = best_cells(estimates, self._settings, self._model.n_layers)
+        patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), kept)
+        store = self._workspace.store
+        store.remove({*store.below(self._folder)} - kept)  # of other settings or items
+        return estimates, patches
 
-    def side(name: str, which: str, times_of: str | None = None) -> Side:
-        row = {str(k): v for k, v in of[name, which].items()}
-        clip = workspace.resolve(row["clip"])
-        other = workspace.resolve(of[name, times_of]["clip"]) if times_of else None
-        shown = sample(clip, spec)
-        times = shown_times(shown, clip, spec, other)
-        prompt = model.prompt(system, row["question"], shown.frames, times)
-        return Side(prompt, record(model, prompt, tokens), spans(model, prompt, system, row["question"]))
+    def _each(self, kind: str, make: Callable[[str], Iterable[Row]], kept: set[Path]) -> list[Row]:
+        """The rows of all pairs: read where a file holds them, else made and written."""
+        rows, store = list[Row](), self._workspace.store
+        for number, name in enumerate(self._names, start=1):
+            path = self._folder / f"{name}-{self._version}-{kind}.json"
+            try:
+                of_pair = json.loads(store.here(path).read_text(encoding="utf-8"))
+            except (FileNotFoundError, ValueError):
+                of_pair = [*make(name)]
+                store.write({path: json.dumps(of_pair).encode()})
+            rows += of_pair
+            kept.add(path)
+            progress.current().tick("patching", f"pairs of {self._dataset}, {kind}", number, len(self._names))
+        return rows
 
-    for number, name in enumerate(names):
-        for which in SIDES:
-            if (name, which) in of:
-                sides[name, which] = side(name, which)
-        progress.current().tick("patching", f"prompts of {dataset}", number + 1, len(names))
-    for number, (name, into) in enumerate(product(names, SIDES)):
-        progress.current().tick("patching", f"pairs of {dataset}", number + 1, 2 * len(names))
-        towards = "void" if into == "control" else "control"
-        if (name, into) not in sides or (name, towards) not in sides:
-            continue
-        target, own = sides[name, into], sides[name, towards]
-        groups = _groups(target, own)
-        if groups is None:
-            yield {"scenario": name, "into": into, "source": OWN, "left_out": True}
-            continue
-        sources: dict[str, Side | None] = {OWN: own, TIMES: side(name, into, towards)}
-        rest = [*names[names.index(name) + 1 :], *names[: names.index(name)]]
-        for kind, which in ((OTHER, towards), (SAME, into)):
-            found = [sides[o, which] for o in rest if (o, which) in sides and _fits(target, sides[o, which])]
-            sources[kind] = found[0] if found else None
-        for kind, source in sources.items():
-            about = {"scenario": name, "into": into, "source": kind}
-            if source is None or not _fits(target, source):
-                yield about | {"left_out": True}
+    def _estimates(self, name: str) -> Iterator[Row]:
+        for into, target, own, groups in self._directions(name):
+            if groups is None:
+                yield {"scenario": name, "into": into, "source": OWN, "left_out": True}
                 continue
-            wanted = _patches(model.n_layers, groups, settings.sites if kind == OWN else ("residual",))
-            changes = patched_changes(model, target.recorded, source.recorded, [patch for _, patch in wanted], tokens)
-            for (group, patch), value in zip(wanted, changes, strict=True):
-                before, there = target.recorded.margin, own.recorded.margin
-                yield about | {
-                    **{"left_out": False, "site": patch.site, "layer": patch.layer, "group": group},
-                    **{"before": before, "after": before + value, "there": there, "tokens": int(patch.positions.sum())},
-                }
+            ends, changes = self._attributed(target, own)
+            for (site, layer), by_token in changes.items():
+                for group, positions in groups.items():
+                    if positions.any() and site in self._settings.sites:
+                        change = float(by_token[positions].sum())
+                        yield _row(name, into, OWN, (site, layer, group), positions, ends, change)
+
+    def _patches(self, name: str, best: Sequence[Cell]) -> Iterator[Row]:
+        for into, target, _, groups in self._directions(name):
+            if groups is None:
+                continue
+            cells: list[tuple[Site, int, str]]
+            cells = [(site, layer, group) for side, site, layer, group in best if side == into and groups[group].any()]
+            patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
+            plain, there = record(self._model, target.prompt, self._tokens, ()), 0.0
+            for kind in SOURCES:
+                side = self._source(name, into, kind)
+                if side is None:
+                    yield {"scenario": name, "into": into, "source": kind, "left_out": True}
+                    continue
+                margin, changes = self._patched(plain, side, patches)
+                there = margin if kind == OWN else there
+                for cell, patch, change in zip(cells, patches, changes, strict=True):
+                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, there), float(change))
+            del plain  # before the other side's pass is recorded
+
+    def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
+        """The margins of both sides, and the estimated change by each token; the states are gone afterwards."""
+        plain = record(self._model, target.prompt, self._tokens, ())
+        source = record(self._model, own.prompt, self._tokens, self._settings.sites)
+        return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
+
+    def _patched(self, target: Recorded, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
+        """The margin of a source, and the changes by patches from it; its states are gone afterwards."""
+        source = record(self._model, side.prompt, self._tokens, self._settings.sites)
+        return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
+
+    def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
+        """Each side of a pair that has both, with the other side and the groups of positions."""
+        if all((name, side) in self._items for side in SIDES):
+            for into, towards in (SIDES, SIDES[::-1]):
+                target, own = self._side(name, into), self._side(name, towards)
+                yield into, target, own, groups_of(target, own)
+
+    def _source(self, name: str, into: str, kind: str) -> Side | None:
+        """The side that patches into a pair's side come from; None if there is none of its form."""
+        towards = SIDES[1 - SIDES.index(into)]
+        where = {OWN: (name, towards, ""), TIMES: (name, into, towards)}
+        if kind in where:
+            candidates = [where[kind]]
+        else:
+            first = self._names.index(name)
+            others = [*self._names[first + 1 :], *self._names[:first]]
+            candidates = [(other, towards if kind == OTHER else into, "") for other in others]
+        form = self._form(name, into)
+        for candidate in candidates:
+            if candidate[:2] in self._items and _fits(form, self._form(*candidate)):
+                return self._side(*candidate)
+        return None
+
+    def _form(self, name: str, which: str, times_of: str = "") -> Mapping[str, np.ndarray]:
+        if (name, which, times_of) not in self._parts:
+            self._side(name, which, times_of)
+        return self._parts[name, which, times_of]
+
+    def _make_side(self, name: str, which: str, times_of: str = "") -> Side:
+        row = self._items[name, which]
+        clip, question = self._workspace.resolve(row["clip"]), str(row["question"])
+        other = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
+        shown = sample(clip, self._spec)
+        times = shown_times(shown, clip, self._spec, other)
+        prompt = self._model.prompt(self._system, question, shown.frames, times)
+        side = Side(prompt, spans(self._model, prompt, self._system, question))
+        self._parts[name, which, times_of] = side.parts
+        return side
 
 
-def _fits(target: Side, source: Side) -> bool:
-    """Whether the two prompts have the same form, part by part."""
-    return target.recorded.length == source.recorded.length and all(
-        np.array_equal(target.parts[part], source.parts[part]) for part in ("system", "stamps", "visual")
-    )
+def _row(
+    scenario: str,
+    into: str,
+    source: str,
+    cell: tuple[Site, int, str],
+    positions: np.ndarray,
+    ends: tuple[float, float],
+    change: float,
+) -> Row:
+    """What a patch does to one pair. ends: the outcomes of the side that is patched and of the other one."""
+    site, layer, group = cell
+    about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
+    return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
 
 
-def _patches(n_layers: int, groups: Mapping[str, np.ndarray], sites: Sequence[str]) -> list[tuple[str, Patch]]:
-    wanted: list[tuple[str, Patch]] = []
-    for site, layer, (name, positions) in product(sites, range(n_layers + 1), groups.items()):
-        if positions.any() and (layer or site == "residual"):
-            wanted.append((name, Patch(site, layer, positions)))  # pyright: ignore[reportArgumentType]
-    return wanted
+def _fits(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
+    """Whether two prompts have the same form, part by part."""
+    return all(np.array_equal(target[part], source[part]) for part in ("system", "stamps", "visual"))
 
 
-def _groups(target: Side, other: Side) -> dict[str, np.ndarray] | None:
-    """The groups of positions of a pair; None if the two prompts have another form. A model whose pixels do not lie
-    token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens: all count as changed."""
-    if not _fits(target, other):
+def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
+    """Return the groups of positions of a pair, (T,) bool each; None if the two prompts have another form.
+
+    A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
+    all count as changed.
+    """
+    if not _fits(target.parts, other.parts):
         return None
     parts, visual = target.parts, target.parts["visual"]
     changed = changed_tokens(target.prompt, other.prompt, visual)
     changed = visual if changed is None else changed
-    found = {"system": parts["system"], "stamps": parts["stamps"], "changed": changed, "unchanged": visual & ~changed}
-    found |= {"question": parts["question"], "last": parts["last"], "all": np.ones(len(visual), bool)}
-    return {name: found[name] for name in GROUPS}
+    groups = {"changed": changed, "unchanged": visual & ~changed, "all": np.ones(len(visual), bool)}
+    groups |= {name: parts[name] for name in ("system", "stamps", "question", "last")}
+    return {name: groups[name] for name in GROUPS}
 
 
-def _summed(changes: pd.DataFrame, extraction: Extraction, dataset: str, seed: int) -> Iterator[PatchingRow]:
-    """The rows of a dataset from its changes: ratios of sums over pairs, with intervals by scenario. Where all pairs
-    were left out, a row without an effect says so."""
-    if changes.empty:
-        return
-    keys = ["into", "source", "site", "layer", "group"]
-    left = changes.loc[changes["left_out"].astype(bool)].groupby(["into", "source"]).size().to_dict()
-    made = changes.loc[~changes["left_out"].astype(bool)]
-    for (into, source), count in left.items():
-        if not ((made["into"] == into) & (made["source"] == source)).any():
-            nothing = dict.fromkeys(("effect", "low", "high", "flips"))
-            about: dict[str, Any] = {"into": into, "source": source, "site": "residual", "layer": 0, "group": "all"}
-            yield PatchingRow(
-                **extraction.partition, dataset=dataset, **about, **nothing, n_flippable=0, n=0, n_left_out=count,
-                tokens=0.0,
-            )  # fmt: skip
-    for key, group in made.groupby(keys, sort=True) if len(made) else ():
-        into, source, site, layer, name = cast(tuple[Any, ...], key)
-        before, after, there = (group[column].to_numpy(float) for column in ("before", "after", "there"))
-        effect, low, high = effect_of(before, after, there, seed)
-        differs = np.sign(group["before"]) != np.sign(group["there"])
-        flipped = (np.sign(group["after"]) != np.sign(group["before"])) & differs
+def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
+    """Return the cells to patch: of each direction those with the largest estimates over all pairs, at every so many
+    layers. All positions of the residual stream are left out, whose effect is 1 by construction."""
+    layers = {*range(0, n_layers + 1, settings.stride), n_layers}
+    sums = defaultdict[Cell, float](float)
+    for row in estimates:
+        if "left_out" not in row and row["layer"] in layers and (row["site"], row["group"]) != ("residual", "all"):
+            sums[row["into"], row["site"], row["layer"], row["group"]] += row["change"]
+    by_size = [
+        nlargest(settings.exact, (c for c in sums if c[0] == into), key=lambda c: abs(sums[c])) for into in SIDES
+    ]
+    return sorted(cell for cells in by_size for cell in cells)
+
+
+def summed(
+    estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
+) -> Iterator[PatchingRow]:
+    """The rows of a dataset: ratios of sums over pairs, with intervals by scenario for what was patched. Where all
+    pairs were left out, a row without an effect says so."""
+    left_out = Counter((row["into"], row["source"]) for row in (*estimates, *patches) if "left_out" in row)
+    cells = [defaultdict[tuple[Any, ...], list[Row]](list), defaultdict[tuple[Any, ...], list[Row]](list)]
+    for by_cell, rows in zip(cells, (estimates, patches), strict=True):
+        for row in rows:
+            if "left_out" not in row:
+                by_cell[row["into"], row["source"], row["site"], row["layer"], row["group"]].append(row)
+    estimated, patched = cells
+    present = {key[:2] for key in (*estimated, *patched)}
+    nothing = [(*key, "residual", 0, "all") for key in left_out if key not in present]
+    for key in sorted({*estimated, *patched, *nothing}):
+        into, source, site, layer, group = key
+        rows = patched.get(key) or estimated.get(key) or []
+        before, there, change = (np.array([row[name] for row in rows]) for name in ("before", "there", "change"))
+        gap = float((there - before).sum()) if len(rows) else 0.0
+        attributed = sum(row["change"] for row in estimated.get(key, ()))
+        effect = effect_of(before, before + change, there, seed) if key in patched else (None, None, None)
+        differs = np.sign(before) != np.sign(there)
+        flipped = (np.sign(before + change) != np.sign(before)) & differs
         yield PatchingRow(
             **extraction.partition,
             dataset=dataset,
             into=into,
             source=source,
             site=site,
-            layer=int(layer),
-            group=name,
-            effect=effect,
-            low=low,
-            high=high,
-            flips=float(flipped.sum() / differs.sum()) if differs.any() else None,
+            layer=layer,
+            group=group,
+            attributed=attributed / gap if key in estimated and gap else None,
+            effect=effect[0],
+            low=effect[1],
+            high=effect[2],
+            flips=float(flipped.sum() / differs.sum()) if key in patched and differs.any() else None,
             n_flippable=int(differs.sum()),
-            n=len(group),
-            n_left_out=int(left.get((into, source), 0)),
-            tokens=float(group["tokens"].mean()),
+            n=len(rows),
+            n_left_out=left_out[into, source],
+            tokens=float(np.mean([row["tokens"] for row in rows])) if rows else 0.0,
         )
 
 
 def effect_of(
     before: np.ndarray, after: np.ndarray, there: np.ndarray, seed: int
 ) -> tuple[float | None, float | None, float | None]:
-    """The indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each): sum(after - before)
-    over sum(there - before), each (pairs,). A ratio of sums, since the ratio of a pair whose sides hardly differ is
-    noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's width. None where the
-    sides do not differ at all."""
+    """Return the indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each).
+
+    It is sum(after - before) over sum(there - before), each (pairs,): a ratio of sums, since the ratio of a pair whose
+    sides hardly differ is noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's
+    width. None where the sides do not differ at all.
+    """
     moved, apart = after - before, there - before
     if not apart.sum():
         return None, None, None

@@ -5,6 +5,10 @@ positions of one site: the residual stream as it leaves block l (0: the embeddin
 attention or MLP. The outcome is the log-odds that the answer begins by abstaining (`margin`), and the indirect effect
 is the share of the way from the target's outcome to the source's: 0 if nothing changed, 1 if it is the source's.
 
+`patched_changes` measures it; a pass begins at the patched block, from the target's recorded state.
+`attributed_changes` estimates it for every position, site and layer from one backward pass (attribution patching): the
+gradient of the target's outcome along the difference of the two states.
+
 A residual patch at layer l replaces everything that blocks behind l read of the patched positions; without that,
 replacing all positions does not give the source's answer. In some models this is more than the state there:
 
@@ -22,11 +26,11 @@ else of earlier ones are refused (`require_patchable`).
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
-from itertools import product
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,7 +49,7 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 SITES: tuple[Site, ...] = ("residual", "attention", "mlp")
-ROWS = 64  # patches in one pass
+ROWS, TOKENS = 64, 2**14  # patches in one pass: at most so many, and fewer of long prompts
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +63,20 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """The decoder's part of a pass. inputs: what the decoder was called with, after the vision tower. states: by site
-    and layer, (T, d). margin: the outcome. pictures: which tokens are visual, (T,) bool. per_layer: what each block was
-    given of the token's own, (T, width), empty for a model without that. shared: by name, the keys and values (heads,
-    T, width) that blocks read of an earlier one."""
+    """The decoder's part of a pass.
+
+    inputs: what the decoder was called with, after the vision tower. states: by site and layer, (T, d); the residual
+    stream always, other sites as asked for. margin: the outcome. pictures: which tokens are visual, (T,) bool.
+    per_layer: what each block was given of the token's own, (T, width), empty for a model without that. shared: by
+    name, the layer that made keys and values which later blocks read, and these, (1, heads, T, width).
+    """
 
     inputs: Mapping[str, Any]
     states: Mapping[tuple[Site, int], Tensor]
     margin: float
     pictures: np.ndarray
     per_layer: Sequence[Tensor] = ()
-    shared: Mapping[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    shared: Mapping[str, tuple[int, Tensor, Tensor]] = field(default_factory=dict)
 
     @property
     def length(self) -> int:
@@ -109,19 +116,27 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
             yield site, layer, part
 
 
-def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int]) -> Recorded:
-    """One pass with everything that a patch may take from it. tokens: those that begin an abstention."""
+def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> Recorded:
+    """Run one pass and keep what a patch may take from it, at the residual stream and at `sites`.
+
+    tokens: those that begin an abstention. Raises TrapsError for a block that hands on more than the residual stream.
+    """
     import torch
 
     inputs: dict[str, Any] = {}
     states: dict[tuple[Site, int], Tensor] = {}
     per_layer: list[Tensor] = []
-    shared: dict[str, tuple[Tensor, Tensor]] = {}
+    shared: dict[str, tuple[int, Tensor, Tensor]] = {}
 
     def keep_inputs(_: Module, __: Any, kwargs: dict[str, Any]) -> None:
         inputs.update(kwargs)
 
-    def keep(site: Site, layer: int, _: Module, __: Any, output: Any) -> None:
+    def keep(site: Site, layer: int, module: Module, __: Any, output: Any) -> None:
+        if site == "residual" and not torch.is_tensor(output):
+            raise TrapsError(
+                f"{model.checkpoint.name}: {type(module).__name__} returns more than the residual stream, so no pass "
+                "can begin behind it; set `patching: null` in the experiment and in study.yaml"
+            )
         states[site, layer] = first_tensor(output)[0].clone()
 
     def keep_own(block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
@@ -129,18 +144,20 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int]) -> Recorded
         if own is not None:
             per_layer.append(own[0])
 
-    def keep_shared(block: Module, args: tuple[Any, ...], kwargs: dict[str, Any], _: Any) -> None:
+    def keep_shared(layer: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any], _: Any) -> None:
         for name, (keys, values) in (given(block, SHARED, args, kwargs) or {}).items():
-            shared[name] = keys[0], values[0]
+            if name not in shared or shared[name][1] is not keys:
+                shared[name] = layer, keys, values
 
     with ExitStack() as hooks, torch.inference_mode():
         decoder = model.network.get_decoder()
         hooks.callback(decoder.register_forward_pre_hook(keep_inputs, with_kwargs=True).remove)
         for site, layer, module in _sites(model):
-            hooks.callback(module.register_forward_hook(partial(keep, site, layer)).remove)
-        for block in model.blocks:
+            if site == "residual" or site in sites:
+                hooks.callback(module.register_forward_hook(partial(keep, site, layer)).remove)
+        for layer, block in enumerate(model.blocks, start=1):
             hooks.callback(block.register_forward_pre_hook(keep_own, with_kwargs=True).remove)
-        hooks.callback(model.blocks[-1].register_forward_hook(keep_shared, with_kwargs=True).remove)
+            hooks.callback(block.register_forward_hook(partial(keep_shared, layer), with_kwargs=True).remove)
         hooks.enter_context(model.remembering_clips())
         last = model.forward(prompt).last_hidden_state[:, -1]
         states["residual", 0] = inputs["inputs_embeds"][0].clone()
@@ -151,33 +168,119 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int]) -> Recorded
 def patched_changes(
     model: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], tokens: Sequence[int]
 ) -> np.ndarray:
-    """The change of the target's outcome by each patch from the source, (patches,). The vision tower is not run again.
+    """Measure the change of the target's outcome by each patch from the source, (patches,).
 
-    Every pass has one row without a patch, and changes are against that row: a patch that replaces states by equal ones
-    changes nothing, bit for bit, whatever the size of the batch does to rounding. Raises TrapsError when the two
-    prompts have another number of tokens, or other visual positions.
+    Passes begin at the lowest patched block of their rows; the vision tower is not run again. Every pass has one row
+    without a patch, and changes are against that row: a patch that replaces states by equal ones changes nothing, bit
+    for bit, whatever the size of the batch does to rounding. Raises TrapsError when the two prompts have another number
+    of tokens, or other visual positions.
     """
+    import torch
+
+    _require_one_form(target, source)
+    changes, rows = np.empty(len(patches)), max(1, min(ROWS, TOKENS // target.length))
+    order = sorted(range(len(patches)), key=lambda i: _first_layer(model, patches[i]))
+    for chosen in (order[k : k + rows] for k in range(0, len(order), rows)):
+        batch = [patches[i] for i in chosen]
+        weights = _masks(batch, target.length, model.device)
+        with torch.inference_mode():
+            margins = _margins(model, target, source, weights, _first_layer(model, batch[0]), 1 + len(batch), tokens)
+        changes[chosen] = (margins[1:] - margins[0]).double().numpy()
+    return changes
+
+
+def attributed_changes(
+    model: LocalModel, target: Recorded, source: Recorded, tokens: Sequence[int]
+) -> dict[tuple[Site, int], np.ndarray]:
+    """Estimate the change of the target's outcome by patching each token alone, (T,) by recorded site and layer.
+
+    One pass with gradients gives all of them, to first order; the estimate of a group of positions is its sum. Raises
+    TrapsError as `patched_changes`.
+    """
+    import torch
+
+    _require_one_form(target, source)
+    dtype = model.network.dtype
+    shares = {
+        key: torch.zeros(1, target.length, device=states.device, dtype=dtype, requires_grad=True)
+        for key, states in source.states.items()
+    }
+    with torch.enable_grad():
+        (margin,) = _margins(model, target, source, shares, 0, 1, tokens)
+        slopes = torch.autograd.grad(margin, [*shares.values()])
+    return {key: slope[0].double().cpu().numpy() for key, slope in zip(shares, slopes, strict=True)}
+
+
+# --- one pass ---------------------------------------------------------------------------------------------------------
+
+# By site and layer, (rows, T): how much of each token's state is the source's. bool: all of it or nothing; else that
+# share of the difference is added, so that the gradient at zeros is what `attributed_changes` asks for.
+Weights = Mapping[tuple[Site, int], "Tensor"]
+
+
+def _require_one_form(target: Recorded, source: Recorded) -> None:
     if not np.array_equal(target.pictures, source.pictures):
         raise TrapsError(
             f"a prompt of {source.length} tokens cannot be patched into one of {target.length}, or their visual tokens "
             "stand at other places; patch between prompts of one form"
         )
-    changes = [_one_pass(model, target, source, patches[k : k + ROWS], tokens) for k in range(0, len(patches), ROWS)]
-    return np.concatenate(changes) if changes else np.empty(0)
 
 
-def _one_pass(
-    model: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], tokens: Sequence[int]
-) -> np.ndarray:
+def _first_layer(model: LocalModel, patch: Patch) -> int:
+    """The layer whose recorded state a patched pass can begin with. Raises TrapsError for a site that is not there."""
+    if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
+        raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
+    return patch.layer if patch.site == "residual" else patch.layer - 1
+
+
+def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
+    """The weights of a pass with one row for each patch behind a row without any."""
     import torch
 
-    patches = [Patch("residual", 0, np.zeros(target.length, bool)), *patches]
-    with torch.inference_mode(), _patching(model, source, patches):
-        inputs = _repeated(target, len(patches))
-        _patch_inputs(inputs, target, source, patches)
+    masks: dict[tuple[Site, int], Tensor] = {}
+    for row, patch in enumerate(patches, start=1):
+        nothing = torch.zeros(len(patches) + 1, length, dtype=torch.bool)
+        masks.setdefault((patch.site, patch.layer), nothing)[row] = torch.from_numpy(patch.positions)
+    return {key: mask.to(device) for key, mask in masks.items()}
+
+
+def _behind(weights: Weights, layer: int) -> Tensor | None:
+    """The weights of residual patches at a layer or below it, which are all behind them."""
+    parts = [part for (site, at), part in weights.items() if site == "residual" and at <= layer]
+    return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
+
+
+def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
+    """States (rows, .., T, d), of which the source's, (T, d) or (1, .., T, d), take the part that weights say."""
+    import torch
+
+    weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
+    theirs = theirs.to(own.device)
+    return torch.where(weights, theirs, own) if weights.dtype == torch.bool else own + weights * (theirs - own)
+
+
+def _margins(
+    model: LocalModel,
+    target: Recorded,
+    source: Recorded,
+    weights: Weights,
+    start: int,
+    rows: int,
+    tokens: Sequence[int],
+) -> Tensor:
+    """The outcomes (rows,) of a pass over so many copies of the target, from the state at layer `start` on."""
+    inputs = _repeated(target, rows)
+    if ("residual", 0) in weights:
+        inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
+    for number, theirs in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
+        # Features number k are added to what block k + 1 puts out: behind the sites up to there.
+        behind, features = _behind(weights, number + 1), inputs["deepstack_visual_embeds"]
+        if behind is not None and target.visual is not None:
+            own = features[number].unflatten(0, (rows, -1))
+            features[number] = _mixed(own, theirs, behind[:, target.visual]).flatten(0, 1)
+    with _replacing(model, target, source, weights, start, rows):
         last = model.network.get_decoder()(**inputs).last_hidden_state[:, -1]
-        margins = first_token_margins(model, last, tokens).double().numpy()
-    return margins[1:] - margins[0]
+    return first_token_margins(model, last, tokens)
 
 
 def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
@@ -195,86 +298,43 @@ def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
     return inputs | {"use_cache": False, "past_key_values": None}
 
 
-def _patch_inputs(inputs: dict[str, Any], target: Recorded, source: Recorded, patches: Sequence[Patch]) -> None:
-    """Embeddings and deepstack features of the rows with a residual patch."""
-    import torch
-
-    features, theirs = (of.inputs.get("deepstack_visual_embeds") for of in (target, source))
-    for row, patch in enumerate(patches):
-        if patch.site != "residual":
-            continue
-        chosen = torch.from_numpy(patch.positions).to(inputs["inputs_embeds"].device)
-        if patch.layer == 0:
-            inputs["inputs_embeds"][row, chosen] = source.states["residual", 0][chosen]
-        if features is None or theirs is None or target.visual is None:
-            continue
-        visual = torch.from_numpy(np.flatnonzero(patch.positions[target.visual])).to(chosen.device)
-        # Features number k are added to what block k + 1 puts out: behind the site where that is block l or later.
-        for number in range(max(0, patch.layer - 1), len(features)):
-            start = row * len(features[number])
-            inputs["deepstack_visual_embeds"][number][start + visual] = theirs[number][visual]
-
-
 @contextmanager
-def _patching(model: LocalModel, source: Recorded, patches: Sequence[Patch]) -> Iterator[None]:
-    """Hooks that replace the outputs of sites; they are removed at the end, whatever happens."""
-    import torch
-
-    by_site: dict[tuple[Site, int], list[tuple[int, Any]]] = {}
-    for row, patch in enumerate(patches):
-        if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
-            raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
-        if patch.layer:
-            by_site.setdefault((patch.site, patch.layer), []).append((row, torch.from_numpy(patch.positions)))
+def _replacing(
+    model: LocalModel, target: Recorded, source: Recorded, weights: Weights, start: int, rows: int
+) -> Iterator[None]:
+    """Let passes begin behind block `start` and take what weights say from the source; all is undone at the end."""
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
-        states = first_tensor(output).clone()
-        for row, chosen in by_site[site, layer]:
-            states[row, chosen.to(states.device)] = source.states[site, layer][chosen.to(states.device)]
+        states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])
         return (states, *output[1:]) if isinstance(output, tuple) else states
 
-    residual = [(row, patch) for row, patch in enumerate(patches) if patch.site == "residual"]
+    def skip(layer: int, hidden_states: Tensor, *_: Any, **__: Any) -> Tensor:
+        return target.states["residual", layer].expand(rows, -1, -1) if layer == start else hidden_states
+
+    def beside(below: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """The arguments of the block above `below` others, with the source's where the stream below was patched."""
+        own, behind = given(block, PER_LAYER, args, kwargs), _behind(weights, below)
+        if own is not None and behind is not None:
+            args, kwargs = giving(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
+        shared = given(block, SHARED, args, kwargs)  # one mapping, which all blocks are given
+        if shared is not None and below == start:
+            for name, (maker, *pair) in target.shared.items():
+                if maker <= start:
+                    shared[name] = tuple(part.expand(rows, *part.shape[1:]) for part in pair)
+        if shared and ("residual", below) in weights:
+            here = weights["residual", below]
+            for name, pair in [*shared.items()]:
+                shared[name] = tuple(_mixed(*both, here) for both in zip(pair, source.shared[name][1:], strict=True))
+        return args, kwargs
+
+    blocks = [*model.blocks]
     with ExitStack() as hooks:
         for site, layer, module in _sites(model):
-            if (site, layer) in by_site:
+            if (site, layer) in weights:
                 hooks.callback(module.register_forward_hook(partial(replace, site, layer)).remove)
-        for below, block in enumerate(model.blocks):
-            beside = partial(_patch_arguments, source, residual, below)
-            hooks.callback(block.register_forward_pre_hook(beside, with_kwargs=True).remove)
+        for below, block in enumerate(blocks[start:], start=start):
+            hooks.callback(block.register_forward_pre_hook(partial(beside, below), with_kwargs=True).remove)
+        for layer, block in enumerate(blocks[:start], start=1):
+            block.forward = partial(skip, layer)
+            hooks.callback(vars(block).pop, "forward")
         yield
-
-
-def _patch_arguments(
-    source: Recorded,
-    residual: Sequence[tuple[int, Patch]],
-    below: int,
-    block: Module,
-    args: tuple[Any, ...],
-    kwargs: dict[str, Any],
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments of the block above `below` others, with the source's own where the residual stream was patched."""
-    own = given(block, PER_LAYER, args, kwargs)
-    if own is not None:
-        own = own.clone()
-        for row, patch in residual:
-            if patch.layer <= below:
-                _put(own[row], source.per_layer[below], patch)
-        args, kwargs = giving(block, PER_LAYER, own, args, kwargs)
-    # What is shared so far was made by the blocks below, and this block is the first one behind these patches. All that
-    # follow are given the same mapping.
-    shared = given(block, SHARED, args, kwargs)
-    here = [(row, patch) for row, patch in residual if patch.layer == below]
-    for name, pair in [*shared.items()] if shared and here else ():
-        made = tuple(part.clone() for part in pair)
-        for (row, patch), (part, theirs) in product(here, zip(made, source.shared[name], strict=True)):
-            _put(part[row].transpose(0, 1), theirs.transpose(0, 1), patch)
-        shared[name] = made
-    return args, kwargs
-
-
-def _put(states: Tensor, theirs: Tensor, patch: Patch) -> None:
-    """Replace (T, ...) by theirs where a patch says."""
-    import torch
-
-    chosen = torch.from_numpy(patch.positions).to(states.device)
-    states[chosen] = theirs[chosen]

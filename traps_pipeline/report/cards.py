@@ -120,7 +120,9 @@ def figure_card(report: FigureReport, sources: Sources) -> Card:
     if report.published:
         with suppress(NotRun):
             pictures["The paper’s"] = _picture(f"{report.name}_published", report.figure(sources.paper))
-    return Card(name, report.title, _fragment("figures", pictures=pictures, alt=report.title, shows=report.doc))
+    return Card(
+        name, report.title, _fragment("figures", pictures=pictures, alt=report.title, shows=report.note(sources.study))
+    )
 
 
 def picture_card(name: str, title: str, make: Callable[[], Mapping[str, Figure]], kind: str) -> Card:

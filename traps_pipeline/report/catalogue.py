@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
-from traps_pipeline.report.figures import abstention, grids, landscape, steering_figures
+from traps_pipeline.report import findings
+from traps_pipeline.report.figures import abstention, expression_figures, grids, landscape, steering_figures
 from traps_pipeline.report.figures import control_figures as figures_of_inside
 from traps_pipeline.report.printed import printed_mechanism as printed_mechanism
 from traps_pipeline.report.printed import printed_scores as printed_scores
@@ -54,6 +55,7 @@ JUDGED_STAGES = {
     "steering_pecs",
     "gate",
     "risk_coverage",
+    "item_scores",
     "corrected",
 }
 
@@ -120,11 +122,16 @@ class FigureReport:
     make: Callable[[Results], Figure]
     reads: tuple[str, ...]
     published: bool = True
+    finding: Callable[[Results], str] = lambda results: ""
 
     @property
     def doc(self) -> str:
         """What it shows."""
         return _first_paragraph(self.make)
+
+    def note(self, results: Results) -> str:
+        """Return what it says of a study, in one sentence a model where it has one, and what it shows."""
+        return f"{self.finding(results)} {self.doc}".strip()
 
     def files(self, results: Results) -> dict[str, bytes]:
         """PDF, SVG and PNG by path; none if the figure was not run."""
@@ -274,11 +281,23 @@ FIGURES: tuple[FigureReport, ...] = (
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", grids.sub_scenarios, ("metrics", "items")),
     FigureReport("confabulation", "Prevalence of confabulation", grids.confabulation, ("confabulation_prevalence",)),
     FigureReport(
+        "states_and_output",
+        "States against output, item by item",
+        expression_figures.states_and_output,
+        ("item_scores",),
+        published=False,
+        finding=findings.states_and_output,
+    ),
+    FigureReport(
+        "lens", "The margin by layer", expression_figures.lens, ("lens",), published=False, finding=findings.lens
+    ),
+    FigureReport(
         "probe_baselines",
         "Probes against their baselines",
         figures_of_inside.probe_baselines,
         ("probes", "probe_baselines"),
         published=False,
+        finding=findings.probe_baselines,
     ),
     FigureReport(
         "gate_arrows",
@@ -286,14 +305,23 @@ FIGURES: tuple[FigureReport, ...] = (
         figures_of_inside.gate_arrows,
         ("gate", "risk_coverage"),
         published=False,
+        finding=findings.gate_arrows,
     ),
-    FigureReport("patching", "Activation patching", figures_of_inside.patching, ("patching",), published=False),
+    FigureReport(
+        "patching",
+        "Activation patching",
+        figures_of_inside.patching,
+        ("patching",),
+        published=False,
+        finding=findings.patching,
+    ),
     FigureReport(
         "doses_among_nulls",
         "Doses among nulls",
         figures_of_inside.doses_among_nulls,
         ("steering_effects", "steering_nulls"),
         published=False,
+        finding=findings.doses_among_nulls,
     ),
     FigureReport(
         "probe_curves", "Probe transfer by layer", steering_figures.probe_curves, ("probes",), published=False
@@ -310,7 +338,8 @@ FIGURES: tuple[FigureReport, ...] = (
     FigureReport("cosines", "Cosines of void directions", steering_figures.cosine_heatmaps, ("cosines",)),
 )
 
-INSIDE = ("probe_baselines", "gate_arrows", "patching", "doses_among_nulls")  # figures of controls inside models
+# Figures that a study leads with which looked inside models: the claim, and what can refute it.
+INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patching", "doses_among_nulls")
 
 
 def folder(kind: str, results: Results) -> str:

@@ -1,154 +1,150 @@
-"""What a study found, in sentences: the first thing on its report. Every number is one of the report's tables."""
+"""What the lead figures inside models say of a study, in one sentence a model, from the frames that they draw."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
+import numpy as np
+
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.report.figures.expression_figures import orders, scored_items
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import interval, ranks
-from traps_pipeline.report.writing import fraction, percent
-from traps_pipeline.scoring.analyses import models_of
+from traps_pipeline.report.tables.control_reports import beside
+from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
 
 if TYPE_CHECKING:
     import pandas as pd
 
-ASKED = {STANDARD: "Asked plainly (standard)", GUIDED: "Told not to guess (guided)"}
+ALPHA = 0.05 + 1e-9
+_CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A sentence, and the name of the card with its numbers."""
-
-    text: str
-    card: str
+def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    for model, of in rows.groupby("model", sort=False, observed=True):
+        yield plain(str(model)), of
 
 
-def findings(results: Results) -> list[Finding]:
-    """Return the findings of a study, the most important first; none if it has no overall figures.
-
-    Reference strategies, whose score is known, are left out where any other model was asked.
-    """
-    overall = results.overall
-    rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
-    known = rows["model"].isin(models_of(group="reference")) if len(rows) else rows
-    if not len(rows):
-        return []
-    own = rows.loc[~known] if not known.all() else rows
-    return [*_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
-            *_missing(own)]  # fmt: skip
-
-
-def _best(rows: pd.DataFrame) -> Iterator[Finding]:
-    """The best model of each regime, and how many others the contrasts cannot tell from it."""
-    for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
-        part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
-        first = part.to_dict("records")[0]
-        figure = fraction(first["pecs"])
-        equal, others = ([*part.loc[part["pecs"].map(fraction).eq(figure) == same, "model"]] for same in (True, False))
-        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if others else "has a PECS of"
-        text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
-        if others:
-            text += f", before {others[0]} with {fraction(part.loc[part['model'] == others[0], 'pecs'].iloc[0])}"
-        alike = ranks(first)
-        if len(equal) == 1 and "–" in alike:
-            text += f"; its rank may be {alike}, since contrasts do not separate it from others"
-        yield Finding(f"{text}.", "leaderboard")
+def states_and_output(results: Results) -> str:
+    """How many voids that were answered states and output put among voids, and how well either orders the sides."""
+    sentences = list[str]()
+    for model, of in _models(scored_items(results)):
+        voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
+        controls = of.loc[of["side"] == "control"]
+        if not len(voids):
+            sentences.append(f"{model} answered no void under standard: nothing is encoded and not expressed.")
+            continue
+        encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
+        wrongly = int((controls["own"] > 0).sum())
+        areas = [orders(part) for _, part in of.groupby("dataset", sort=False, observed=True)]
+        states, output = (sum(area) / len(areas) for area in zip(*areas, strict=True))
+        sentences.append(
+            f"{model} answered {len(voids)} voids under standard: its states put {encoded} of them among voids (and "
+            f"{wrongly} of {len(controls)} controls), its output {expressed}; as an order of the sides, the AUROC of "
+            f"states is {states:.2f} and of output {output:.2f} (mean of datasets)."
+        )
+    return " ".join(sentences)
 
 
-def _names(models: list[str]) -> str:
-    """Up to three names, and how many more."""
-    shown, more = models[:3], len(models) - 3
-    parts = [*shown, f"{more} more"] if more > 0 else shown
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+def lens(results: Results) -> str:
+    """By how much the guided prompt moves the margin of each side at the last layer and at the one before."""
+    sentences = list[str]()
+    for model, of in _models(results.lens):
+        means = of.groupby(["prompt", "layer"], observed=True).agg(
+            voids=("voids", "mean"), controls=("controls", "mean")
+        )
+        at = {(row["prompt"], row["layer"]): row for row in means.reset_index().to_dict("records")}
+        top = max(layer for _, layer in at)
+        if not all((prompt, layer) in at for prompt in PROMPTING for layer in (top, top - 1)):
+            continue
+        moved = [
+            at["guided", layer][side] - at["standard", layer][side]
+            for layer in (top, top - 1)
+            for side in ("voids", "controls")
+        ]
+        sentences.append(
+            f"In {model} the guided prompt moves the log-odds of abstaining by {moved[0]:+.1f} on voids and "
+            f"{moved[1]:+.1f} on controls at the last layer, and by {moved[2]:+.1f} and {moved[3]:+.1f} one layer "
+            "before (means over datasets)."
+        )
+    return " ".join(sentences)
 
 
-def _abstention(rows: pd.DataFrame) -> Iterator[Finding]:
-    for regime, words in ASKED.items():
-        part = rows.loc[rows["regime"] == regime]
-        if len(part):
-            who = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
-            voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
-            yield Finding(
-                f"{words}, {who} on {voids} of the voids, which cannot be answered, and on {controls} of the "
-                "controls, which can.",
-                "figure-abs_rec",
+def probe_baselines(results: Results) -> str:
+    """On how many pairs states are above every raw input, the margin and the noise; within and across datasets."""
+    sentences = list[str]()
+    for model, of in _models(beside(results)):
+        states, noise, spread = (of[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
+        beaten = np.column_stack([of[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
+        above, across = states > np.fmax.reduce(beaten, axis=1), (of["source"] != of["target"]).to_numpy(bool)
+        counts = [f"{np.count_nonzero(above & kind)} of {np.count_nonzero(kind)}" for kind in (across, ~across)]
+        sentences.append(
+            f"{model}: states are above every raw input, the output margin and noise on {counts[0]} pairs of datasets, "
+            f"and on {counts[1]} datasets themselves."
+        )
+    return " ".join(sentences)
+
+
+def gate_arrows(results: Results) -> str:
+    """What the default gate does to PECS, beside the best gate on anything else than states."""
+    rows = results.gate
+    rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
+    sentences = list[str]()
+    for model, of in _models(rows.loc[rows["pecs"].notna()]):
+        for regime, part in of.groupby("regime", sort=False, observed=True):
+            gates = {row["features"]: row for row in part.to_dict("records")}
+            own = gates.pop("states", None)
+            if own is None or not gates:
+                continue
+            best = max(gates.values(), key=lambda row: row["pecs"])
+            sentences.append(
+                f"{model} under {regime}: a gate on states takes PECS from {own['plain_pecs']:.2f} to "
+                f"{own['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
             )
+    return " ".join(sentences)
 
 
-def _accuracy(rows: pd.DataFrame) -> Iterator[Finding]:
-    """By how much guided prompting changes Acc and AbsRec of the models that were asked both ways."""
-    wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
-    if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
-        changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
-        acc, voids = (_points(changes[name]) for name in ("acc", "abs_rec"))
-        yield Finding(
-            f"Guided prompting changes abstention on voids by {voids} points, and accuracy on controls by {acc}.",
-            "table-guided_uplift",
+def doses_among_nulls(results: Results) -> str:
+    """Where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
+    rows = results.nulls
+    sentences = list[str]()
+    for model, of in _models(rows.loc[rows["target"] != "all"]):
+        cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+        for row in of.to_dict("records"):
+            about = {str(name): value for name, value in row.items()}
+            cells.setdefault(tuple(about[name] for name in _CELL), []).append(about)
+        ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
+        best = max(ahead, key=lambda row: row["effect"], default=None)
+        sentences.append(
+            f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of {len(cells)} cells"
+            + (f", most of all {_cell(best)}." if best else ".")
         )
+    return " ".join(sentences)
 
 
-def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
-    """Visual against textual voids, and the part of PECS that may come from shortcuts."""
-    rates = results.rates
-    pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
-    pooled = pooled.dropna(subset=["visual", "textual"])
-    if len(pooled):
-        textual, visual = (percent(pooled[name].mean()) for name in ("textual", "visual"))
-        who = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
-        yield Finding(
-            f"Asked plainly, {who} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
-            f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
-            f"{' (means)' if len(pooled) > 1 else ''}.",
-            "figure-visual_textual",
+def _cell(row: dict[str, Any]) -> str:
+    moved = "more" if row["side"] == "control" else "fewer"
+    return (
+        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']}, where {row['effect']:.0%} {moved} of {row['n']} "
+        f"{row['side']}s are abstained on"
+    )
+
+
+def patching(results: Results) -> str:
+    """The group of positions that carries most of the difference at the first layer and at the last."""
+    rows = results.patching
+    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
+    sentences = list[str]()
+    for model, of in _models(rows.loc[rows["group"] != "all"]):
+        means = of.groupby(["layer", "group"], observed=True).agg(effect=("effect", "mean")).reset_index()
+        first, last = (
+            max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
+            for layer in (of["layer"].min(), of["layer"].max())
         )
-    robust = results.robust
-    robust = robust.loc[robust["model"].isin(rows["model"])].dropna(subset=["gap"]) if len(robust) else robust
-    if len(robust):
-        most = robust.sort_values(["gap", "model"], ascending=[False, True]).to_dict("records")[0]
-        yield Finding(
-            f"Without shortcuts PECS falls by up to {fraction(most['gap'])}: {most['model']} under {most['regime']} "
-            f"keeps {fraction(most['pecs_r'])} (PECS-R).",
-            "leaderboard",
+        sentences.append(
+            f"In {model} the difference of the output is carried by {first['group']} tokens at the embeddings "
+            f"({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."
         )
-
-
-def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
-    contrasts = results.contrasts
-    if len(contrasts):
-        models = contrasts["left_model"].isin(rows["model"]) & contrasts["right_model"].isin(rows["model"])
-        of = contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
-        tested = contrasts.loc[models & of & contrasts["difference"].notna()]
-        if len(tested):
-            count = int(tested["separable"].eq(True).sum())
-            yield Finding(
-                f"Of {len(tested)} differences of PECS between models under one regime, {count} "
-                f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
-                "table-contrasts",
-            )
-
-
-def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
-    missing = int(rows["n_missing"].sum())
-    if missing:
-        asked = int((2 * rows["n_pairs"] * rows["n_runs"]).sum())
-        most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).iloc[0]
-        yield Finding(
-            f"{missing} of {asked} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
-            f"most, {int(most['n_missing'])}.",
-            "leaderboard",
-        )
-
-
-def _span(shares: pd.Series) -> str:
-    """The smallest and the largest share in percent, once if they print alike."""
-    low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
-    return f"{low} %" if low == high else f"{low} to {high} %"
-
-
-def _points(changes: pd.Series) -> str:
-    """The smallest and the largest change in points of percent, with their signs."""
-    low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
-    return low if low == high else f"{low} to {high}"
+    return " ".join(sentences)

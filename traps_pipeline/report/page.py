@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from traps_pipeline.report.cards import Address, Card, tables_html
-from traps_pipeline.report.findings import Finding
 from traps_pipeline.report.leaderboard_page import leaderboards, legend, provenance
+from traps_pipeline.report.study_findings import Finding
 from traps_pipeline.report.writing import TEMPLATES, environment
 
 FIRST = "figure-pecs_landscape"  # beside the leaderboard

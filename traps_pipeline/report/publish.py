@@ -21,11 +21,11 @@ from traps_pipeline.report.cards import (
     table_card,
 )
 from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
-from traps_pipeline.report.findings import findings
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.pair_pictures import PairPictures
 from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.study_findings import study_findings
 from traps_pipeline.report.tables.audited import audit_table
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.terms import INSIDE_TERMS
@@ -81,7 +81,7 @@ def report_files(
         [card for chapter, card in cards if chapter == name] for name in ("figures", "pictures", "tables")
     )
     page = report_html(
-        study.board, figures, pictures, tables, findings=findings(study), address=address,
+        study.board, figures, pictures, tables, findings=study_findings(study), address=address,
         explorer=EXPLORER if address else "", robust=study.robust, said=said,
         terms=INSIDE_TERMS if study.mechanism else None,
     )  # fmt: skip

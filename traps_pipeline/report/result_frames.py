@@ -14,6 +14,8 @@ from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, JUDGE_VAL
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.control_rows import (
     GATE,
+    ITEM_SCORES,
+    LENS,
     PATCHING,
     PROBE_BASELINES,
     RISK_COVERAGE,
@@ -147,6 +149,8 @@ class Results:
     steering_regimes = Made(
         "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
     )
+    lens = Made(table=LENS)
+    item_scores = Made("ITEM_SCORES rows under PROBE_PROMPT.", table=ITEM_SCORES)
     steering_families = Made(
         "Rows of `mechanism.effects.family_asymmetry`.",
         derive=lambda results: effects.family_asymmetry(results.effects),

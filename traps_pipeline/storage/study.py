@@ -135,6 +135,10 @@ class PatchingSettings(BaseModel):
     sites: tuple[Literal["residual", "attention", "mlp"], ...] = Field(
         default=("residual", "attention", "mlp"), min_length=1
     )
+    exact: int = Field(
+        default=24, ge=1, description="cells of each direction that are patched: those with the largest estimates"
+    )
+    stride: int = Field(default=4, ge=1, description="these lie at every so many layers, and at the last one")
 
 
 class MechanismSettings(BaseModel):

@@ -108,7 +108,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
         network = network.to(device)
     elif device == "cpu":
         _require_packable(network, checkpoint.name)
-    return LocalModel(network.eval(), processor, checkpoint, params, device)
+    return LocalModel(network.eval().requires_grad_(False), processor, checkpoint, params, device)
 
 
 def _require_packable(network: Any, name: str) -> None:

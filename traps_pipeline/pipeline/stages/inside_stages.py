@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.mechanism.control_rows import (
     GATE,
+    ITEM_SCORES,
+    LENS,
     PATCHING,
     PROBE_BASELINES,
     RISK_COVERAGE,
@@ -132,6 +134,46 @@ risk_coverage = stage(
     scheme=EXTRACTION,
     wants=_gated,
     cost="machine",
+)
+
+
+def _make_lens(workspace: Workspace, key: str) -> Made:
+    """The output margin of stored states at every layer, through the model's final norm and head."""
+    from traps_pipeline.mechanism.lens import lens_rows
+
+    return Made(lens_rows(workspace, *_examined(workspace, key)))
+
+
+lens = stage(
+    LENS,
+    _make_lens,
+    group=GROUP,
+    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
+    scheme=EXTRACTION,
+    cost="machine",
+)
+
+
+def _make_item_scores(workspace: Workspace, key: str) -> Made:
+    """What states and output say of each item, by probes that have not seen its scenario, beside its verdicts."""
+    from traps_pipeline.mechanism.item_scores import item_score_rows
+
+    return Made(item_score_rows(workspace, *_examined(workspace, key)))
+
+
+item_scores = stage(
+    ITEM_SCORES,
+    _make_item_scores,
+    group=GROUP,
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(probes, SAME),
+        of(verdicts, _GATED, need="none"),
+        probing_settings,
+    ],
+    scheme=EXTRACTION,
+    cost="machine",
+    wants=_gated,
 )
 
 

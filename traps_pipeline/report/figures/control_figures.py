@@ -157,11 +157,12 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
 
 def patching(results: Results) -> Figure:
     """Indirect effect of each group of positions at each layer, for patches from the void into the control and back; 1
-    is the whole difference of the outcome. The residual stream is all that a block hands on; attention and MLP, where
+    is the whole difference of the outcome. Framed cells were patched; the others are estimates to first order, from one
+    backward pass a pair. The residual stream is all that a block hands on; attention and MLP, where
     they were patched, are what one block adds to it. stamps are the time stamps, changed and unchanged
     the visual tokens whose pixels differ between the sides and those whose pixels do not; last is the last token."""
     rows = results.patching
-    rows = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()]
+    rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
     if not len(rows):
         absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
         raise NotRun(absent)
@@ -197,8 +198,12 @@ def patching(results: Results) -> Figure:
 
 
 def _effects(ax: Axes, part: pd.DataFrame) -> Any:
-    wide = part.pivot_table(index="group", columns="layer", values="effect", observed=True).reindex([*GROUPS])
+    from matplotlib.patches import Rectangle
+
+    values = part.assign(value=part["effect"].fillna(part["attributed"]), measured=part["effect"].notna().astype(float))
+    wide = values.pivot_table(index="group", columns="layer", values="value", observed=True).reindex([*GROUPS])
     wide = wide.dropna(how="all")
+    measured = values.pivot_table(index="group", columns="layer", values="measured", observed=True).reindex(wide.index)
     values = wide.to_numpy(float)
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
     ax.set_xticks(range(values.shape[1]), [str(layer) for layer in wide.columns])
@@ -206,6 +211,8 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
     ax.set_xlabel("layer (0: embeddings)")
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
+    for row, column in np.argwhere(measured.to_numpy(float) > 0):
+        ax.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, edgecolor=INK, linewidth=0.8))
     if values.shape[1] <= 12:
         for (row, column), value in np.ndenumerate(values):
             if value == value:

@@ -20,7 +20,7 @@ def patching(results: Results) -> list[PrintedTable]:
     nulls = rows.loc[rows["source"] != "pair"]
     wide = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
     names = ["other scenario", "same side", "other times"]
-    own = rows.loc[rows["source"] == "pair"].astype(dict.fromkeys(keys, object))
+    own = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()].astype(dict.fromkeys(keys, object))
     table = own.merge(
         wide.reindex(columns=names).reset_index().astype(dict.fromkeys(keys, object)), on=keys, how="left"
     )
@@ -34,7 +34,8 @@ def patching(results: Results) -> list[PrintedTable]:
     columns = [
         MODEL, Column("name", "Dataset"), Column("into", "Into"), Column("where", "Site"), LAYER,
         Column("group", "Positions"),
-        Column("tokens", "Tokens", "ratio"), Column("effect", "Indirect effect", "fraction", mark="mark"),
+        Column("tokens", "Tokens", "ratio"), Column("attributed", "Estimate", "fraction"),
+        Column("effect", "Indirect effect", "fraction", mark="mark"),
         Column("low", "from", "fraction"), Column("high", "to", "fraction"), Column("flips", "Flipped %", "percent"),
         Column("n_flippable", "of", "count"), *(Column(name, name.capitalize(), "fraction") for name in names),
         Column("n", "Pairs", "count"), Column("n_left_out", "Left out", "count"),
@@ -47,6 +48,8 @@ def patching(results: Results) -> list[PrintedTable]:
         "changed: visual tokens whose pixels differ between the sides; the columns other scenario, same side and other "
         "times are patches from another scenario’s other side, another scenario’s same side, and the item’s own frames "
         "with the other side’s times, in the residual stream alone",
+        "estimate: of the indirect effect, to first order, from one backward pass a pair; the rows are those cells of "
+        "site, layer and positions whose estimates are largest",
         *([FEW_NOTE.replace("controls or voids", "pairs")] if "†" in set(table["mark"]) else []),
     ]
     absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"

@@ -320,7 +320,7 @@ def _layers(results: Results) -> PrintedTable:
     ]  # fmt: skip
     notes = [
         "without a dataset: mean AUROC of the probes of the other datasets on each other, those of one taxonomy fitted "
-        "without the scored scenario; ← the layer at which that dataset is read, the middle one of equal ones",
+        "without the scored scenario; * the layer at which that dataset is read, the middle one of equal ones",
         "own maxima: datasets whose own cross-validation is highest at this layer; a maximum that several layers share "
         "chooses none of them",
         *notes,
@@ -345,7 +345,7 @@ def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
         choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within["source"])}
         for name, choice in choices.items():
             part[name] = pd.Series(choice.curve)
-            part[f"{name}_mark"] = ["←" if layer == choice.layer else "" for layer in part.index]
+            part[f"{name}_mark"] = ["*" if layer == choice.layer else "" for layer in part.index]
         parts.append(part.reset_index().assign(model=model))
         tied = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
         notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tied)}")

@@ -1,0 +1,70 @@
+"""What a model's states and its output say of each item, beside its verdict: encoded, and expressed or not.
+
+Every score of states is of a probe that was not fitted on the item's scenario, at the layer that is chosen without the
+item's dataset, counted from the probe's own mid threshold (half-way between the sides' means).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.base import progress
+from traps_pipeline.mechanism.baselines import NoMargin, output_margins
+from traps_pipeline.mechanism.control_rows import ItemScoreRow
+from traps_pipeline.mechanism.gate import MID, OTHER_DATASETS, decide, sources_of_gate
+from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table, outcomes_of, read_states
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.storage.workspace import Workspace
+
+
+def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ItemScoreRow]:
+    """Return the rows of ITEM_SCORES of an extraction: one for each item of a dataset of pairs."""
+    settings, table = workspace.mechanism, gate_table(states)
+    there = [name for name in DATASETS if len(states.dataset(name))]
+    layers = chosen_layers(workspace, states, there)
+    outcomes = {regime: outcomes_of(workspace, entry.id, regime, states) for regime in PROMPTING}
+    try:
+        margins = output_margins(entry, states, there)
+    except NoMargin as error:
+        progress.current().note(f"item_scores: no output margin ({error})")
+        margins = {}
+    about = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
+    rows: list[ItemScoreRow] = []
+    for dataset in there:
+        features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
+        scores: dict[str, np.ndarray] = {}
+        items = gate_items(table, features, shuffled=False, seed=settings.seed)
+        for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
+            if sources_of_gate(source, dataset, there):
+                found = decide(items, source, dataset, solver=settings.probes.solver, **about)
+                scores[name] = found.score - found.threshold[MID]
+        for place, item in enumerate(states.dataset(dataset).to_dict("records")):
+            abstained: dict[str, Any] = {
+                f"abstained_{regime}": _decided(of[dataset].abstained[place] if of else np.nan)
+                for regime, of in outcomes.items()
+            }
+            rows.append(
+                ItemScoreRow(
+                    **states.extraction.partition,
+                    **{name: item[name] for name in ("item_id", "dataset", "scenario_id", "side")},
+                    layer=layers[dataset],
+                    own=_number(scores["own"][place]),
+                    others=_number(scores["others"][place]) if "others" in scores else None,
+                    margin=float(margins[dataset][place, 0]) if margins else None,
+                    **abstained,
+                )
+            )
+    return rows
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _decided(value: float) -> bool | None:
+    return bool(value) if np.isfinite(value) else None

@@ -1,0 +1,125 @@
+"""What a model encodes and what it expresses: states against output item by item, and the margin by layer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.mechanism.probes import auroc
+from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.report.result_frames import Results, datasets_of
+from traps_pipeline.report.tables.steering_tables import why
+from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, NotRun, figure_style, new_figure, plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CONTROL, VOID = COLOURS[0], COLOURS[1]
+_LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
+
+
+def states_and_output(results: Results) -> Figure:
+    """Every item by what states and output say of it, both read under the standard VQA prompt. Up: the score of a probe
+    that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the answer begins with an
+    abstention. A filled marker was answered under standard, a hollow one abstained on. Orange filled markers above the
+    line and left of it are encoded and not expressed. Above each panel: how well either orders voids before controls
+    (AUROC), and what noise gives under the same split (mean and two deviations). A gap is one of orders too only where
+    states are above the output by more than that."""
+    rows = scored_items(results)
+    if not len(rows):
+        absent = why(results) if results.is_study else "the paper prints no scores of items"
+        raise NotRun(absent)
+    from matplotlib.lines import Line2D
+
+    models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.6 + 1.9 * len(models))
+        axes = figure.subplots(len(models), len(datasets), squeeze=False, sharey="row")
+        for line, model in zip(axes, models, strict=True):
+            for ax, dataset in zip(line, datasets, strict=True):
+                part = rows.loc[(rows["model"] == model) & (rows["dataset"] == dataset)]
+                _scatter(ax, part)
+                states, output = orders(part)
+                figures = f"states {states:.2f}, output {output:.2f}{_floor(results, str(model), dataset)}"
+                ax.set_title(f"{plain(str(model))[:20]}: {SHORT[dataset]}, n {len(part)}\n{figures}", size=6.5)
+            line[0].set_ylabel("states: log-odds of void")
+        for ax in axes[-1]:
+            ax.set_xlabel("output: log-odds of abstaining", size=7)
+        marker: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4}
+        handles = [
+            Line2D([], [], color=VOID, label="void, answered", **marker),
+            Line2D([], [], color=VOID, markerfacecolor="white", label="void, abstained", **marker),
+            Line2D([], [], color=CONTROL, label="control, answered", **marker),
+            Line2D([], [], color=CONTROL, markerfacecolor="white", label="control, abstained", **marker),
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def scored_items(results: Results) -> pd.DataFrame:
+    """Return the items of which both a score of states and an output margin are known."""
+    rows = results.item_scores
+    return rows.loc[rows["margin"].notna() & rows["own"].notna()]
+
+
+def orders(rows: pd.DataFrame) -> tuple[float, float]:
+    """Return the AUROC of states and of output on some items."""
+    void = (rows["side"] == "void").to_numpy()
+    states, output = auroc(void, rows[["own", "margin"]].to_numpy(float))
+    return float(states), float(output)
+
+
+def _floor(results: Results, model: str, dataset: str) -> str:
+    rows = results.baselines
+    rows = rows.loc[(rows["features"] == "noise") & (rows["analysis"] == "held_out") & (rows["model"] == model)]
+    rows = rows.loc[(rows["source"] == dataset) & (rows["target"] == dataset)]
+    noise = [(float(mean), float(spread)) for mean, spread in zip(rows["value"], rows["spread"], strict=True)]
+    return f"\nnoise {noise[0][0]:.2f} ± {2 * noise[0][1]:.2f}" if noise else ""
+
+
+def _scatter(ax: Axes, rows: pd.DataFrame) -> None:
+    for line in (ax.axhline, ax.axvline):
+        line(0, color=INK, linewidth=0.6, zorder=0.5)
+    for side, colour in (("control", CONTROL), ("void", VOID)):
+        for abstained, face in ((False, colour), (True, "white")):
+            part = rows.loc[(rows["side"] == side) & rows["abstained_standard"].fillna(False).eq(abstained)]
+            ax.scatter(part["margin"], part["own"], s=12, facecolors=face, edgecolors=colour, linewidths=0.7, zorder=3)
+
+
+def lens(results: Results) -> Figure:
+    """Mean log-odds of abstaining that the state of each layer gives through the model's own final norm and head (logit
+    lens), of voids (orange) and controls (blue), under both VQA prompts. Where the lines of a side part, the prompt
+    decides; at the last layer they are the output. The dotted line is even odds."""
+    rows = results.lens
+    if not len(rows):
+        absent = why(results) if results.is_study else "the paper has no such curves"
+        raise NotRun(absent)
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import MaxNLocator
+
+    models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.6 + 1.7 * len(models))
+        axes = figure.subplots(len(models), len(datasets), squeeze=False, sharey="row")
+        for line, model in zip(axes, models, strict=True):
+            for ax, dataset in zip(line, datasets, strict=True):
+                of = rows.loc[(rows["model"] == model) & (rows["dataset"] == dataset)].sort_values("layer")
+                for prompt, style in _LINES.items():
+                    part = of.loc[of["prompt"] == prompt]
+                    for side, colour in (("controls", CONTROL), ("voids", VOID)):
+                        ax.plot(part["layer"], part[side], style, color=colour, marker="o", markersize=2.4, linewidth=1)
+                ax.axhline(0, color=INK, linewidth=0.6, linestyle=":", zorder=0.5)
+                ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+                ax.set_title(f"{plain(str(model))[:20]}: {SHORT[dataset]}", size=7.5)
+            line[0].set_ylabel("log-odds of abstaining")
+        for ax in axes[-1]:
+            ax.set_xlabel("layer (0: embeddings)")
+        handles = [
+            Line2D([], [], color=colour, linestyle=style, label=f"{side}, {prompt}")
+            for side, colour in (("voids", VOID), ("controls", CONTROL))
+            for prompt, style in _LINES.items()
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
