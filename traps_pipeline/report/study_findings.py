@@ -34,10 +34,11 @@ def study_findings(results: Results) -> list[Finding]:
     """
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
-    known = rows["model"].isin(models_of(group="reference")) if len(rows) else rows
     if not len(rows):
         return []
-    own = rows.loc[~known] if not known.all() else rows
+    references = models_of(group="reference")
+    own = rows.loc[[model not in references for model in rows["model"]]]
+    own = own if len(own) else rows
     inside = [(report.name, report.finding(results)) for report in FIGURES] if results.mechanism else []
     return [
         *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
@@ -100,7 +101,7 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
     pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
     pooled = pooled.dropna(subset=["visual", "textual"])
     if len(pooled):
-        textual, visual = (percent(pooled[name].mean()) for name in ("textual", "visual"))
+        textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
         who = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
         yield Finding(
             f"Asked plainly, {who} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
@@ -135,10 +136,10 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
-    missing = int(rows["n_missing"].sum())
+    missing = int(rows["n_missing"].to_numpy(int).sum())
     if missing:
-        asked = int((2 * rows["n_pairs"] * rows["n_runs"]).sum())
-        most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).iloc[0]
+        asked = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
+        most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield Finding(
             f"{missing} of {asked} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
             f"most, {int(most['n_missing'])}.",

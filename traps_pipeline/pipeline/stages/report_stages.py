@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from traps_pipeline.pipeline.graph import Parent
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.pipeline.previews import Markdown
 from traps_pipeline.pipeline.stage import code_of, is_declared, of, source, stage
@@ -63,7 +64,7 @@ def _site(workspace: Workspace, _: None) -> Made:
     return Made(files)
 
 
-def _parents(*names: str) -> list[object]:
+def _parents(*names: str) -> list[Parent]:
     return [of(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
 
 
