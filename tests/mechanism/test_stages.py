@@ -24,6 +24,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.baselines import baseline_rows
+from traps_pipeline.mechanism.cosines import cosine_rows
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.mechanism_rows import (
@@ -179,9 +180,10 @@ def test_directions_are_what_the_states_say(study: Workspace) -> None:
     assert row["direction_digest"] == vector_digest(saved) and row["n_pairs"] == 3 and row["n_steered"] == 1
     assert row["norm"] == pytest.approx(np.linalg.norm(difference), rel=1e-5)
     assert row["residual_norm"] == pytest.approx(np.linalg.norm(at[chosen & ~void], axis=1).mean(), rel=1e-5)
-    cosines = pd.DataFrame(stages.cosine_rows(study))
+    cosines = pd.DataFrame(cosine_rows(study))
     same = cosines.query("dataset == other_dataset and prompt == other_prompt")
     assert np.allclose(same["cosine"], 1) and len(cosines.query("layer == 2")) == 16
+    assert np.allclose(same["disattenuated"].dropna(), 1) and cosines.query("layer == 2")["split_half"].notna().all()
 
 
 def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.calls import entry_of
 from tests.build.ledger import write
-from tests.models.test_budget import PRICED
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.ledger.money import Money, Releasable
@@ -42,7 +42,7 @@ def in_flight(workspace: Workspace, participant: str) -> None:
 
 def room_for(workspace: Workspace, dollars: float) -> bool:
     """Whether a call of so many dollars fits into the study's budget."""
-    with spending(workspace, [PRICED]) as budget:
+    with spending(workspace, [entry_of("m")]) as budget:
         try:
             reservation = asyncio.run(budget.reserve("m", dollars))
         except BudgetReached:

@@ -158,14 +158,6 @@ def test_a_held_out_set_tells_no_side_no_pair_and_no_answer(workspace: Workspace
         held_out_key(tmp_path / "other")
 
 
-def test_another_folder_is_not_written_into(workspace: Workspace, tmp_path: Path) -> None:
-    (tmp_path / "letter.txt").write_text("mine")
-    with pytest.raises(TrapsError, match="holds other files"):
-        write_release(content_of(workspace), tmp_path, Options())
-    with pytest.raises(TrapsError, match="no items of the arm 'decoy'"):
-        content_of(workspace, ["decoy"])
-
-
 def test_a_clip_that_is_not_its_items_is_named_and_nothing_is_written(demo_study: Checkout, tmp_path: Path) -> None:
     clip = next((demo_study.workspace / "clips" / "plinko-0001").glob("void*.mp4"))
     clip.write_bytes(b"other")

@@ -124,14 +124,6 @@ def test_an_edited_vote_is_named_though_all_numbers_were_made_anew(packed: Path,
     assert found[0].endswith("correct is True, its rules say False")
 
 
-def test_a_vote_of_the_rules_that_is_called_unread_is_named(packed: Path, tmp_path: Path) -> None:
-    def edit(frames: Frames) -> None:
-        put(frames, "votes", "invalid_reason", "unread", model="prior", task="abstention", judge="rule-1")
-
-    (problem,) = problems(forged(packed, tmp_path / "f.zip", edit))
-    assert problem.endswith("invalid_reason is 'unread', its rules say None")
-
-
 def test_an_edited_number_is_named(packed: Path, tmp_path: Path) -> None:
     def edit(frames: Frames) -> None:
         put(frames, "leaderboard", "pecs", 0.75, model="prior", regime="json", dataset="overall")

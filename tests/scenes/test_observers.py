@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.scenes import fingerprints
+from tests.scenes.observed import frozen, observed
 from tests.scenes.released import SAMPLED, Released, first_of_each, load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.observe import family_asking
@@ -45,7 +45,7 @@ def test_the_observer_answers_the_control_and_abstains_on_every_void_as_frozen(s
         assert observe(padded, question) is None
     else:  # the colour of the panel tells it nothing
         assert observe(case.void_behind(OTHER_PANEL[ALL.index(scenario_id) % 2]), question) is None
-    assert fingerprints.observed(case) == fingerprints.frozen()["families"][case.family.name]["observed"]
+    assert observed(case) == frozen()[case.family.name]
 
 
 # --- arms -------------------------------------------------------------------------------------------------------------

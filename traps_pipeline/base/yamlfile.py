@@ -119,10 +119,12 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def within(path: Path) -> Iterator[None]:
-    """Name the file in which the block found what it complains of."""
+    """Name the file in an error of the block that does not name it."""
     try:
         yield
     except TrapsError as error:
+        if str(error).startswith(f"{path}: "):
+            raise
         raise TrapsError(f"{path}: {error}") from error
 
 

@@ -203,6 +203,13 @@ class CosineRow:
     other_prompt: Prompt
     other_dataset: shared.Dataset
     cosine: Annotated[float, "-1 to 1"]
+    disattenuated: Annotated[
+        float | None,
+        "the same of products of different scenarios, so without their noise; null if nothing else is left",
+    ]
+    low: Annotated[float | None, "95 % interval of the disattenuated cosine, scenarios resampled"]
+    high: Annotated[float | None, "95 % interval of the disattenuated cosine, scenarios resampled"]
+    split_half: Annotated[float | None, "cosine between directions of random halves of the first one's pairs, mean"]
 
 
 COSINES = Table(

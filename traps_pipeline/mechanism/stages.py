@@ -15,7 +15,6 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.directions import (
     Directions,
     Origin,
-    cosine_matrix,
     direction_scenarios,
     extract_directions,
     load_directions,
@@ -27,7 +26,6 @@ from traps_pipeline.mechanism.mechanism_rows import (
     DIRECTIONS,
     PROBE_ITEMS,
     PROBES,
-    CosineRow,
     DirectionRow,
     HiddenStatesRow,
     ProbeRow,
@@ -42,9 +40,12 @@ from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.storage.media import MediaSpec
+from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from traps_pipeline.mechanism.hidden_states import Item
     from traps_pipeline.models.local.adapter import LocalModel
 
@@ -218,21 +219,33 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
     return rows
 
 
-def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str) -> list[DirectionRow]:
-    settings, items = workspace.mechanism, states.dataset(dataset)
+def direction_pairs(
+    settings: MechanismSettings, dataset: str, items: pd.DataFrame
+) -> tuple[list[str], list[int], list[int]]:
+    """Return the scenarios that a dataset's direction is computed from, and the rows of their voids and controls among
+    the dataset's items. Raises TrapsError for a study that steers nothing."""
     steering = settings.steering
     if steering is None:
         raise TrapsError(
             "study.yaml: mechanism.steering is null, so the number of pairs for a direction is not known; set it there "
             "and in the experiment"
         )
-    names = sorted(set(items["scenario_id"]))
     most = steering.ill_posed_pairs if is_ill_posed(dataset) else steering.well_posed_pairs
-    chosen = direction_scenarios(names, most, settings.seed)
+    chosen = direction_scenarios(sorted(set(items["scenario_id"])), most, settings.seed)
+    place = {
+        (name, side): row for row, (name, side) in enumerate(zip(items["scenario_id"], items["side"], strict=True))
+    }
+    voids, controls = ([place[name, side] for name in chosen] for side in ("void", "control"))
+    return chosen, voids, controls
+
+
+def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str) -> list[DirectionRow]:
+    settings, items = workspace.mechanism, states.dataset(dataset)
+    steering = settings.steering
+    chosen, *sides = direction_pairs(settings, dataset, items)
+    assert steering is not None, "direction_pairs refuses a study that steers nothing"
+    names = sorted(set(items["scenario_id"]))
     steered = set(steered_scenarios(names, steering.pairs, settings.seed)) & set(chosen)
-    scenario, void = items["scenario_id"].to_numpy(str), (items["side"] == "void").to_numpy()
-    place = {(name, side): row for row, (name, side) in enumerate(zip(scenario, void, strict=True))}
-    sides = [[place[name, side] for name in chosen] for side in (True, False)]
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
     voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
     seed = [settings.seed, DATASETS.index(dataset)]
@@ -290,36 +303,3 @@ def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, 
             )
         found[description["dataset"]] = directions
     return found
-
-
-def cosine_rows(workspace: Workspace) -> list[CosineRow]:
-    """Cosines of every two void directions of a model at one layer, over datasets and VQA prompts."""
-    table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
-    extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
-    rows: list[CosineRow] = []
-    for model in sorted({extraction.model for extraction in extractions}):
-        named = [
-            ((extraction.prompt, dataset), directions.void)
-            for extraction in extractions
-            if extraction.model == model
-            for dataset, directions in saved_directions(workspace, extraction).items()
-        ]
-        for layer in range(min(len(vectors) for _, vectors in named)):
-            matrix = cosine_matrix(np.stack([vectors[layer] for _, vectors in named]))
-            rows += [
-                CosineRow(
-                    model=model,
-                    layer=layer,
-                    prompt=prompt,
-                    dataset=dataset,
-                    other_prompt=other_prompt,
-                    other_dataset=other_dataset,
-                    cosine=float(matrix[i, j]),
-                )
-                for i, ((prompt, dataset), _) in enumerate(named)
-                for j, ((other_prompt, other_dataset), _) in enumerate(named)
-                if np.isfinite(matrix[i, j])
-            ]
-    if not rows:
-        raise TrapsError("cosines: no directions yet; materialize directions first")
-    return rows

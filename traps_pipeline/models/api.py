@@ -227,14 +227,14 @@ class ApiBackend:
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
         billed = exchange.may_be_billed(status, is_explained=is_explained)
-        place = " (an error object in an HTTP 200)" if exchange.is_answered else ""
-        place += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
+        origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
+        origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if reported.is_filtered and status not in TRANSIENT_STATUSES:
-            self._tell(REFUSED_CONTENT, f"{reported}{place}")
+            self._tell(REFUSED_CONTENT, f"{reported}{origin}")
             return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
         kind = failure_kind(status, reported)
         is_final = kind.startswith("http_")
-        self._tell(kind, f"{reported}{place}", passes=not is_final)
+        self._tell(kind, f"{reported}{origin}", passes=not is_final)
         if is_final:
             return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
         raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None

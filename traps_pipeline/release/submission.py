@@ -201,7 +201,7 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
 
     table = TABLES[file]
     try:
-        found = pq.ParquetFile(io.BytesIO(content))
+        found = pq.ParquetFile(pa.BufferReader(content))
         groups = [found.metadata.row_group(i) for i in range(found.metadata.num_row_groups)]
         if found.metadata.num_rows > MOST_ROWS or sum(g.total_byte_size for g in groups) > MOST_TABLE_BYTES:
             raise TrapsError(f"{path}: {file} is too large ({found.metadata.num_rows} rows)")

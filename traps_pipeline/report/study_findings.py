@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURES
 from traps_pipeline.report.result_frames import Results
@@ -136,7 +138,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
-    missing = int(rows["n_missing"].to_numpy(int).sum())
+    missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
         asked = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]

@@ -201,16 +201,23 @@ directions = stage(
 
 
 def _make_cosines(workspace: Workspace, _: None) -> Made:
-    """Cosines of every two void directions of a model at one layer."""
+    """Cosines of every two void directions of a model at one layer, with their reliability."""
     import pandas as pd
 
-    from traps_pipeline.mechanism.stages import cosine_rows
+    from traps_pipeline.mechanism.cosines import cosine_rows
 
     table = pd.DataFrame(cosine_rows(workspace))
     return Made(table, shown={"cosines": rows_shown(table)})
 
 
-cosines = stage(COSINES, _make_cosines, group=GROUP, parents=[of(directions, need="some")], wants=steers)
+cosines = stage(
+    COSINES,
+    _make_cosines,
+    group=GROUP,
+    code="2",
+    parents=[of(directions, need="some"), of(hidden_states, need="some")],
+    wants=steers,
+)
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:

@@ -1,0 +1,133 @@
+"""Cosines of void directions, with what few pairs take away from them and shared controls add.
+
+A direction is a mean over pairs, so its noise makes its cosine with any other direction too small, and where two
+datasets have the same controls, their common noise makes it too large. Products of *different* scenarios have neither:
+the disattenuated cosine is made of them alone. The split half says how far other pairs give the same direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.mechanism.directions import cosine_matrix
+from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, CosineRow
+from traps_pipeline.mechanism.nulls import nulled
+from traps_pipeline.mechanism.stages import direction_pairs, saved_directions
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.transfer_paths import FAMILIES
+from traps_pipeline.protocol.cells import Extraction
+from traps_pipeline.protocol.datasets import taxonomy_of
+from traps_pipeline.scoring.bootstrap import scenario_weights
+from traps_pipeline.storage.workspace import Workspace
+
+RESAMPLES, HALVINGS = 200, 50
+
+
+@dataclass(frozen=True, eq=False)
+class PairDifferences:
+    """Void minus control state of each pair of a direction, (n, d), and the number of each pair's scenario, (n,)."""
+
+    values: np.ndarray
+    scenario: np.ndarray
+
+
+def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
+    """Return the mean product of pairs of different scenarios, (draws,): an unbiased product of two mean differences.
+
+    weights: (draws, scenarios), how often each scenario counts.
+    """
+    products = one.values @ other.values.T
+    differ = (one.scenario[:, None] != other.scenario).astype(float)
+    left, right = weights[:, one.scenario], weights[:, other.scenario]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return ((left @ (products * differ)) * right).sum(axis=1) / ((left @ differ) * right).sum(axis=1)
+
+
+def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
+    """Return the cosine of two mean differences without the noise of their pairs, (draws,); it may lie beyond 1, and is
+    NaN where a mean difference is not longer than its noise."""
+    lengths = apart(one, one, weights) * apart(other, other, weights)
+    known = (lengths > 0) & (apart(one, one, weights) > 0)
+    return np.where(known, apart(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
+
+
+def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
+    """Return the cosine between the directions of two halves of the pairs, mean over random halvings."""
+    products, n = of.values @ of.values.T, len(of.values)
+    rng = np.random.default_rng([*seed])
+    first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
+    second = 1 - first
+    dot, one, two = (((a @ products) * b).sum(axis=1) for a, b in ((first, second), (first, first), (second, second)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(np.mean(dot / np.sqrt(one * two)))
+
+
+def cosine_rows(workspace: Workspace) -> list[CosineRow]:
+    """Return the rows of COSINES: every two void directions of a model at one layer, over datasets and VQA prompts."""
+    table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
+    extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
+    rows: list[CosineRow] = []
+    for model in sorted({extraction.model for extraction in extractions}):
+        rows += _of_model(workspace, [one for one in extractions if one.model == model])
+    if not rows:
+        raise TrapsError("cosines: no directions yet; materialize directions first")
+    return rows
+
+
+def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[CosineRow]:
+    named = [
+        (StoredStates.of(workspace, extraction), dataset, directions.void)
+        for extraction in extractions
+        for dataset, directions in saved_directions(workspace, extraction).items()
+    ]
+    pairs = [direction_pairs(workspace.mechanism, dataset, states.dataset(dataset)) for states, dataset, _ in named]
+    ids = pd.Index(sorted({name for names, _, _ in pairs for name in names}))
+    places = [ids.get_indexer(pd.Index(names)) for names, _, _ in pairs]
+    taxonomies = {name: taxonomy_of(d) for (_, d, _), (names, _, _) in zip(named, pairs, strict=True) for name in names}
+    weights = _weights([taxonomies[name] for name in ids], workspace.mechanism.seed)
+    rows: list[CosineRow] = []
+    for layer in range(min(len(vectors) for _, _, vectors in named)):
+        cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in named]))
+        differences = []
+        for (states, dataset, _), (_, voids, controls), place in zip(named, pairs, places, strict=True):
+            at = np.asarray(states.read(dataset, layer), float)
+            differences.append(PairDifferences(at[voids] - at[controls], place))
+        halves = [split_half(of, [workspace.mechanism.seed, layer]) for of in differences]
+        for i, (own, dataset, _) in enumerate(named):
+            for j, (other, other_dataset, _) in enumerate(named):
+                if np.isfinite(cosines[i, j]):
+                    rows.append(
+                        CosineRow(
+                            model=own.extraction.model,
+                            layer=layer,
+                            prompt=own.extraction.prompt,
+                            dataset=dataset,
+                            other_prompt=other.extraction.prompt,
+                            other_dataset=other_dataset,
+                            cosine=float(cosines[i, j]),
+                            **nulled(_figures(differences[i], differences[j], weights) | {"split_half": halves[i]}),
+                        )
+                    )
+    return rows
+
+
+def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> dict[str, float]:
+    drawn = disattenuated(one, other, weights)
+    low, high = (np.nan, np.nan)
+    if np.isfinite(drawn[1:]).mean() > 0.5:
+        low, high = np.nanquantile(drawn[1:], [0.025, 0.975])
+    return {"disattenuated": float(drawn[0]), "low": float(low), "high": float(high)}
+
+
+def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
+    """How often each scenario counts, (1 + RESAMPLES, scenarios): first once, then resampled within its taxonomy."""
+    drawn, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
+    for number, taxonomy in enumerate(FAMILIES):
+        if n := int(np.count_nonzero(of == taxonomy)):
+            drawn[1:, of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
+    return drawn
