@@ -1,6 +1,6 @@
 """Every table and figure by name: the function that makes it from `Results`, and the stages it reads (docs/spec.md 10).
 
-A new table or figure is an entry here. Its asset, its staleness and its place on the report page and in `traps export`
+A new table or figure is an entry here. Its asset, staleness and place on the report page and in `traps results export`
 follow from the entry.
 """
 
@@ -284,7 +284,7 @@ FIGURES: tuple[FigureReport, ...] = (
         "states_and_output",
         "States against output, item by item",
         expression_figures.states_and_output,
-        ("item_scores",),
+        ("item_scores", "sentences", "probe_baselines"),
         published=False,
         finding=findings.states_and_output,
     ),

@@ -1,4 +1,4 @@
-"""The report's parts and files, and `traps export`, which writes all tables, figures and the page to one folder."""
+"""The parts and files of the report, and `traps results export`, which writes all tables and figures to a folder."""
 
 from __future__ import annotations
 
