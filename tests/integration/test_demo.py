@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 NOT_RUN = ("confabulation", "confabulation_prevalence", "judge_validation", "judge_robustness")  # empty, never zeros
 MECHANISM = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
 MECHANISM += ("steering_effects", "steering_shares", "steering_nulls", "steering_pecs")
-MECHANISM += ("probe_baselines", "gate", "risk_coverage", "lens", "item_scores", "patching")
+MECHANISM += ("probe_baselines", "gate", "risk_coverage", "lens", "item_scores", "sentences", "patching")
 PEOPLE = ("human_labels", "human_agreement", "human_row", "panel_errors", "corrected")  # nobody has labelled
 ON_REQUEST = ("arms", "hypotheses", "robust")  # an experiment names arms and variations
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
@@ -75,3 +75,8 @@ def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
         rows = workspace.tables.read_all(table)
         assert rows.empty == (table.name in {*NOT_RUN, *MECHANISM, *PEOPLE, *ON_REQUEST}), table.name
         assert set(rows.get("benchmark_version", ())) <= {load_release().version}, table.name
+
+
+def test_the_pages_of_the_demo_are_few_and_small(demo: Checkout) -> None:
+    files = [path for path in (demo.workspace / "reports").rglob("*") if path.is_file()]
+    assert len(files) <= 30 and sum(path.stat().st_size for path in files) <= 6e6

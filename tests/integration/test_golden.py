@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -19,9 +20,10 @@ VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void'
 
 def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
     assert f"{ANSWERS} answers asked (0 from the ledger)\n{VOTES} votes asked (0 from the ledger)\n" in small_output
-    report = small.workspace / "reports" / "report.html"
-    assert f"report {report}" in small_output.splitlines()
-    assert report.stat().st_size > 1000
+    reports = small.workspace / "reports"
+    for kind, page in (("report", reports / "report.html"), ("explorer", reports / "index.html")):
+        assert f"{kind} {page}" in small_output.splitlines()
+        assert page.stat().st_size > 1000
 
 
 def test_the_oracle_scores_one_and_nothing_is_missing(small: Checkout) -> None:
@@ -47,9 +49,12 @@ def test_a_second_run_does_nothing_and_status_and_plan_agree(study: Checkout) ->
     assert again.code == 0, again.err
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "tables and figures" not in again.err  # no partition was materialized
-    status = study.traps("status", EXPERIMENT).out
+    place, fresh = study.traps("status", EXPERIMENT).out.splitlines()
+    assert place == f"workspace {study.workspace}"
+    assert re.fullmatch(r"all \d+ partitions of \d+ stages are fresh", fresh)
+    stages = {row["stage"]: row for row in json.loads(study.traps("status", EXPERIMENT, "--json").out)["stages"]}
     expected = {"scene_specs": 4, "items": 4, "responses": 24, "verdicts": 24, "leaderboard": 1}
     for stage, partitions in expected.items():
-        assert re.search(rf"^{stage} +{partitions} +0 +0$", status, re.MULTILINE), status
+        assert stages[stage] == {"stage": stage, "fresh": partitions, "stale": {}, "missing": []}
     plan = study.traps("plan", EXPERIMENT).out
     assert re.search(rf"^all +{ANSWERS} +{ANSWERS} +0 +{VOTES:,} +{VOTES:,} +0$", plan, re.MULTILINE), plan

@@ -1,4 +1,4 @@
-"""What errors about what is published, submitted and committed to say to do lets the same command succeed."""
+"""What errors about what is published and submitted say to do lets the same command succeed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.build.commitments import committed
 from tests.conftest import Checkout
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.release.checksums import CHECKSUMS
@@ -21,7 +20,6 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-__all__ = ["committed"]  # the fixture
 
 
 @pytest.fixture(scope="module")
@@ -125,9 +123,9 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     assert told in verify(submission).unchecked
     assert told not in verify(submission, release).unchecked
     remedied(
-        lambda: command("verify", path, "--key", tmp_path / "key.pub"),
+        lambda: command("publish", "verify", path, "--key", tmp_path / "key.pub"),
         "cli.release.verify",
-        again=lambda: command("verify", path),
+        again=lambda: command("publish", "verify", path),
     )
     root = tmp_path / "study"
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))

@@ -20,7 +20,6 @@ import pytest
 from pydantic import ValidationError
 
 from tests.build.errors import raises
-from tests.build.media import IMAGES, VIDEO, drawn, write_clip
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.registry import load_models
@@ -38,6 +37,28 @@ from traps_pipeline.storage.media import (
 )
 from traps_pipeline.video.encode import DamagedClip, decode, decode_sampled, encode
 from traps_pipeline.video.policies import POLICIES, FramePolicy
+
+VIDEO = MediaSpec(profile="video", fps=5)
+
+
+IMAGES = MediaSpec(profile="images", fps=5)
+
+
+def drawn(count: int, height: int = 120, width: int = 160) -> list[np.ndarray]:
+    """A bright square that moves over a gradient, 2 px a frame; no two frames alike."""
+    ramp = np.linspace(0, 200, width).astype(np.uint8)
+    frames = []
+    for i in range(count):
+        frame = np.repeat(np.tile(ramp, (height, 1))[..., None], 3, axis=2)
+        frame[40:80, 2 * i : 2 * i + 40] = (230, 40, 30)
+        frames.append(frame)
+    return frames
+
+
+def write_clip(path: Path, count: int = 50, fps: int = 10) -> tuple[Path, str]:
+    encode(drawn(count), path, fps)
+    return path, file_digest(path)
+
 
 QWEN = MediaSpec(profile="frames", uniform=16)
 GRID = MediaSpec(profile="frames", fps=2, most=32)

@@ -1,4 +1,4 @@
-"""`traps annotate`: people label clips and answers without knowing whose they are, one a screen.
+"""`traps people annotate`: people label clips and answers without knowing whose they are, one a screen.
 
 The server alone knows what is shown. A browser gets a question, a clip or an answer, and a handle that is made for one
 person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.
@@ -31,7 +31,7 @@ from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, 
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
-SCRIPTS = ("dom.js", "player.js", "listening.js", "annotate.js")
+SCRIPTS = ("dom.js", "keys.js", "search.js", "player.js", "listening.js", "annotate.js")
 TITLES: Mapping[TaskName, str] = {
     "answerability": "Clips: what happens?",
     "abstention": "Answers: do they answer?",

@@ -10,8 +10,8 @@ from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
 from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -38,7 +38,7 @@ judge_validation = source(
     "judge_validation",
     _validation_version,
     group=GROUP,
-    doc="The comparison of the judge with two annotators, which `traps confabulation validate` writes.",
+    doc="The comparison of the judge with two annotators, which `traps people validate` writes.",
     kinds=["parquet"],
 )
 _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])

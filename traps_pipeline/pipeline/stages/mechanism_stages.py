@@ -44,7 +44,7 @@ from traps_pipeline.pipeline.schemes import (
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
@@ -190,7 +190,7 @@ directions = stage(
     DIRECTIONS,
     _make_directions,
     group=GROUP,
-    code="2",
+    code="3",
     parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
     scheme=EXTRACTION,
     wants=steers,
@@ -237,7 +237,7 @@ steering = stage(
     STEERING_TABLE,
     Collect(_collect_steering),
     group=GROUP,
-    code="3",
+    code="4",
     parents=[
         of(items, by_dataset),
         of(directions, EVERY, need="some"),
@@ -296,7 +296,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
 
 _ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", parents=_ABOVE, wants=steers)
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="3", parents=_ABOVE, wants=steers)
 
 
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="3", parents=_ABOVE, wants=steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="4", parents=_ABOVE, wants=steers)
