@@ -247,9 +247,12 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
     return rows
 
 
+BOARD_COMES_S = 0.6  # so long a board is seen on its way at most
+
+
 def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None:
-    """The last moment at which a control shows its outcome; null where that is its end."""
-    return None if closes is None or clip is None else (closes - 0.5) / clip["fps"]
+    """The last moment before the board comes into the picture that closes a control; null where none does."""
+    return None if closes is None or clip is None else (closes - 0.5) / clip["fps"] - BOARD_COMES_S
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
