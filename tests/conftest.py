@@ -21,7 +21,6 @@ import pytest
 
 from tests import objectstore
 from tests.build.commands import traps
-from tests.lacking import lack, need
 from tests.objectstore import S3
 from tests.postgres import LACKING, Postgres, programs
 
@@ -319,10 +318,10 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "tiny-disk"
     folder.mkdir()
     if os.geteuid() != 0:
-        lack("mounting a tmpfs needs root")
+        pytest.skip("mounting a tmpfs needs root")
     mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(folder)]
     if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
-        lack("mounting a tmpfs is not permitted here")
+        pytest.skip("mounting a tmpfs is not permitted here")
     try:
         yield folder
     finally:
@@ -333,8 +332,8 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
 def postgres() -> Iterator[Postgres]:
     """A server for the tests of a process, each of which uses a study of its own."""
     if programs() is None:
-        lack(LACKING)
-    need("psycopg", what="psycopg is not installed; `pip install -e '.[dev]'` brings it")
+        pytest.skip(LACKING)
+    pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
     with Postgres.running() as server:
         yield server
 
@@ -343,6 +342,6 @@ def postgres() -> Iterator[Postgres]:
 def s3() -> Iterator[S3]:
     """A server for the tests of a process, each of which uses a study of its own; its keys are in the environment."""
     if not objectstore.is_installed():
-        lack(objectstore.LACKING)
+        pytest.skip(objectstore.LACKING)
     with S3.running() as server, objectstore.exported(server):
         yield server

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from traps_pipeline.base.extras import EXTRAS, ExtraName, missing, require
+from traps_pipeline.base.extras import EXTRAS, ExtraName
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Of modules whose package has another name.
@@ -84,11 +84,6 @@ def test_the_version_has_a_section_in_the_changelog_and_the_wheel_that_pages_nam
     assert PROJECT["version"] in sections
     named_wheels = re.findall(r"traps_pipeline-([\d.]+)-py3", (ROOT / "docs" / "install.md").read_text())
     assert named_wheels and {*named_wheels} == {PROJECT["version"]}
-
-
-def test_nothing_is_missing_where_everything_is_installed_but_nf4_and_signatures() -> None:
-    assert [name for name in EXTRAS if name not in ("nf4", "sign") and missing(name)] == []
-    require("web")  # raises nothing
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,8 @@ from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
     BESIDE,
     CATEGORIES,
-    CHAOTIC_CATEGORIES,
     DATASETS,
     EXTENSION_CATEGORIES,
-    OCCLUSION_CATEGORIES,
     datasets_of_category,
     is_ill_posed,
     taxonomy_of,
@@ -68,10 +66,6 @@ def test_a_key_with_a_wrong_name_is_refused(key: str) -> None:
 def test_a_wrong_cell_key_is_refused(key: str) -> None:
     with raises(ValueError, "protocol.cells"):
         Cell.parse(key)
-
-
-def test_a_category_belongs_to_its_taxonomys_two_datasets() -> None:
-    assert (len(OCCLUSION_CATEGORIES), len(CHAOTIC_CATEGORIES), len(set(CATEGORIES))) == (8, 4, 12)
 
 
 def test_an_extension_is_no_category_of_the_benchmark_and_its_voids_are_those_of_a_panel() -> None:

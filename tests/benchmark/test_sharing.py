@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.build.stores import opened, where
 from tests.conftest import ROOT
-from tests.storage.test_store import opened, where
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.sharing import Filming, Row, share
 from traps_pipeline.storage.store import LEASES, Store
@@ -24,7 +24,7 @@ MAKE = """
 import sys
 from pathlib import Path
 from tests.benchmark.test_sharing import made
-from tests.storage.test_store import opened
+from tests.build.stores import opened
 print(made(opened(*sys.argv[3:]), Path(sys.argv[1]), stops=sys.argv[2] == "stops"))
 """
 

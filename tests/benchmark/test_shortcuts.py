@@ -76,10 +76,6 @@ def test_only_the_planted_cue_tells_control_from_void(
     assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
 
 
-def test_the_figure_is_the_same_on_a_second_build(table: pd.DataFrame) -> None:
-    assert figure_bytes(shortcut_figure(table), "svg") == figure_bytes(shortcut_figure(table), "svg")
-
-
 def test_too_few_scenarios_give_no_row_and_still_a_figure(table: pd.DataFrame) -> None:
     items = pd.DataFrame({c: [] for c in ("dataset", "scenario_id", "pair_id", "side", "question", "clip")})
     few = shortcuts(items, pd.DataFrame({c: [] for c in ("path", "duration_s", "size_bytes")}), Path())

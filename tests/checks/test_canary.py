@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import datetime
+from typing import Any
+
 import pandas as pd
 
-from tests.build.canary import asked
-from traps_pipeline.checks.canary import CANARY, changes, changes_text
+from traps_pipeline.checks.canary import CANARY, CanaryRow, changes, changes_text
+
+
+def asked(epoch: str, item: str, day: int, **said: Any) -> CanaryRow:
+    fields = {"served_model": "m-1", "outcome": "answer", "text": "left", "abstained": False, "value": "left"}
+    at = datetime.datetime(2026, 11, day, tzinfo=datetime.UTC)
+    return CanaryRow(model="m", item_id=item, epoch=epoch, created_at=at, **(fields | {"prompt_tokens": 100} | said))
 
 
 def test_what_changed_between_two_epochs_is_counted_by_item() -> None:

@@ -2,26 +2,58 @@
 
 from __future__ import annotations
 
+import datetime
 import socket
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from tests.build.live import NAME, Check, check
 from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
+from traps_pipeline.checks import live_check
+from traps_pipeline.checks.live_check import Live, check_live
+from traps_pipeline.models import api, registry
 from traps_pipeline.models.judges import JudgeEntry
-
-__all__ = ["check"]  # fixtures
+from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
 
 pytestmark = pytest.mark.slow
+NAME = "seer"
+Check = Callable[..., Live]
+
+
+@pytest.fixture
+def check(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Check:
+    """Checks an entry at the provider, or at another address, live."""
+
+    def checked(kind: type[Entry] = ModelEntry, address: str = "", key: str | None = KEY, **changes: Any) -> Live:
+        account = Account(key=key, base_url=address or f"{provider.url}/v1")
+        for module in (api, registry):
+            monkeypatch.setattr(module, "load_accounts", lambda: {"here": account})
+        fields: dict[str, Any] = {"id": NAME, "backend": "api", "account": "here", "provider_id": f"openai/{NAME}"}
+        fields |= {"prices": Prices(input=0, output=0, as_of=datetime.date(2026, 11, 1))}
+        if kind is ModelEntry:
+            fields |= {"params": {name: value for name, (_, value) in PROTOCOL.items()}}
+            fields |= {"media": {"profile": "images", "fps": 5, "most": 25}}
+        else:
+            fields |= {"params": {"temperature": 0.8, "max_tokens": 512}}
+        entry = kind.model_validate(fields | changes, context={"accounts": {"here": account}})
+        (live,) = check_live([entry])
+        return live
+
+    return checked
 
 
 @pytest.mark.parametrize("profile", ["images", "video"])
 def test_a_model_that_answers_sees_and_keeps_to_the_schema_is_sound(check: Check, profile: str) -> None:
     live = check(media={"profile": profile, "fps": 5, "most": 25})
     assert (live.problems, live.notes) == ([], [])
+
+
+def test_what_is_wrong_is_named_within_half_a_minute() -> None:
+    assert live_check.REACH_S + live_check.TIMEOUT_S <= 30
 
 
 def test_a_dead_endpoint_is_named_with_its_address(check: Check) -> None:
@@ -92,6 +124,8 @@ def test_a_wrong_key_is_named_by_its_variable(check: Check, provider: Provider) 
     provider.configure(fault_by_model={NAME: "unauthorized"})
     (problem,) = check().problems
     assert problem.startswith(f"the key in {KEY} is not accepted")
+    (problem,) = check(key=None).problems
+    assert "a key is wanted" in problem and "`key`" in problem
 
 
 def test_a_model_that_ignores_images_is_named(check: Check, provider: Provider) -> None:
@@ -104,6 +138,13 @@ def test_a_model_that_ignores_the_schema_is_named(check: Check, provider: Provid
     provider.configure(scripts={NAME: {"": "red and then blue"}})
     (problem,) = check().problems
     assert problem.startswith("it ignores the schema") and "json_schema: false" in problem
+
+
+def test_a_model_that_refuses_a_schema_is_asked_without_one(check: Check, provider: Provider) -> None:
+    provider.configure(unstructured=[NAME])
+    (problem,) = check().problems
+    assert problem.startswith("it refuses structured output") and "json_schema: false" in problem
+    assert check(json_schema=False, waivers={"json_schema": "the server refuses it"}).problems == []
 
 
 def test_a_model_that_thinks_inline_is_named_and_sound_once_that_is_declared(check: Check, provider: Provider) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import time
 from pathlib import Path
 
 import pytest
@@ -47,7 +48,7 @@ def test_a_run_brings_what_it_prints_before_its_end_and_at_it(
     with uploading(workspace, "run-1"):
         printed(tmp_path / "cluster" / "logs", "begun\n")
         while bucket.get(name) != b"begun\n":
-            pass
+            time.sleep(0.01)
         printed(tmp_path / "cluster" / "logs", "begun\nended\n")
     assert bucket.get(name) == b"begun\nended\n"
 

@@ -12,7 +12,6 @@ import dagster as dg
 import pytest
 
 from tests.conftest import ROOT
-from tests.lacking import need
 from tests.postgres import Postgres
 from traps_pipeline.cluster.history import HISTORY, LOGS
 from traps_pipeline.cluster.node import REFUSED_TAG
@@ -31,7 +30,8 @@ def nothing() -> None: ...
 @pytest.fixture
 def workspace(tmp_path: Path, postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> Workspace:
     """A study in a shared folder, whose history lies in PostgreSQL."""
-    need("dagster_ray", "dagster_postgres", what="the extra `cluster` is not installed (`make cluster-setup`)")
+    for name in ("dagster_ray", "dagster_postgres"):
+        pytest.importorskip(name, reason="the extra `cluster` is not installed (`make cluster-setup`)")
     for name, value in ((HISTORY, ""), (LOGS, ""), (RAY, "http://127.0.0.1:1"), ("LAB_DATABASE", postgres.address())):
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("DAGSTER_HOME", raising=False)

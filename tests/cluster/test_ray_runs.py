@@ -14,18 +14,16 @@ from typing import Any
 
 import dagster as dg
 import pytest
-from dagster._core.events import StepMaterializationData
 from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
 from tests.postgres import Postgres
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.progress import Progress, Tally, reporting
+from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.videos import CLIPS
 from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml, export
-from traps_pipeline.cluster.node import REFUSED_TAG
-from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
+from traps_pipeline.cluster.ray_runs import RayRuns
 from traps_pipeline.cluster.requests import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.cluster.same_code import code_here, installed, require_same_code
@@ -35,7 +33,7 @@ from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.runs import broke_off, range_tags
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET
 from traps_pipeline.pipeline.stages import benchmark_stages
-from traps_pipeline.pipeline.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
+from traps_pipeline.pipeline.step import RESUMED_ELSEWHERE, end_if_resumed
 from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.study import Study
@@ -111,66 +109,16 @@ def test_rendering_is_as_many_runs_as_the_missing_clips_are_worth(workspace: Wor
         ]  # fmt: skip
 
 
-def test_a_person_is_told_once_that_no_host_takes_any_run(
-    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("traps_pipeline.cluster.ray_runs.IDLE_S", 0.0)
-    shown = Shown()
-    with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
-        run = instance.create_run_for_job(_nothing, tags={"dagster-ray/config": '{"num_cpus": 16}'})
-        starting = dg.DagsterEvent(event_type_value=dg.DagsterEventType.PIPELINE_STARTING.value, job_name="_nothing")
-        instance.report_dagster_event(starting, run.run_id)
-        watching, run_ids = RayRuns(instance, workspace, 1, 0.0, "leave"), [run.run_id]
-        for _ in range(3):
-            watching._look_at([], run_ids, [])
-            time.sleep(0.01)
-        assert [note for note in shown.notes if "for a host that is free and has num_cpus 16" in note] == shown.notes
-        assert len(shown.notes) == 1
-        instance.report_run_failed(run, "it was ended")
-        watching._look_at([], run_ids, [])
-        assert not run_ids
-
-
 class Shown(Progress):
-    """Keeps what is told."""
+    """Keep the stages that are told."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.notes, self.stages = list[str](), list[tuple[str, int]]()
-        self.partitions = list[tuple[str, str]]()
-
-    def partition(self, stage: str, key: str, tally: Tally) -> None:
-        """See `Progress`."""
-        super().partition(stage, key, tally)
-        self.partitions.append((stage, key))
+        self.stages = list[tuple[str, int]]()
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
         self.stages.append((name, partitions))
-
-    def note(self, text: str) -> None:
-        """See `Progress`."""
-        self.notes.append(text)
-
-
-def test_what_runs_did_for_one_partition_is_told_once_and_added_up(workspace: Workspace) -> None:
-    shown, of_both = Shown(), list[str]()
-    with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
-        for about in ({}, {TAKEN: "made by another run meanwhile"}):
-            metadata = {**about, TALLY: json.dumps(vars(Tally(frames=50)))}
-            told = dg.AssetMaterialization("videos", partition="plinko", metadata=metadata)
-            run = instance.create_run_for_job(_nothing)
-            event = dg.DagsterEvent(
-                event_type_value=dg.DagsterEventType.ASSET_MATERIALIZATION.value,
-                job_name="_nothing",
-                event_specific_data=StepMaterializationData(told),
-            )
-            instance.report_dagster_event(event, run.run_id)
-            of_both.append(run.run_id)
-        watching = RayRuns(instance, workspace, 1, 0.0, "leave")
-        for run_id in of_both:
-            watching._report(run_id)
-    assert shown.partitions == [("videos", "plinko")] and shown.totals["videos"].frames == 100
 
 
 def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
@@ -184,25 +132,6 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
         rf"numpy {installed()['numpy']} here and 1\.0 there\. Install",
     ):  # fmt: skip
         require_same_code(json.dumps(theirs), "lab")
-
-
-@pytest.mark.slow
-def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
-    workspace: Workspace, remote: Workspace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("ray", "dagster_ray", "dagster_postgres"):
-        pytest.importorskip(name, reason="the extra `cluster` is not installed")
-    instance = dg.DagsterInstance.ephemeral()
-    with pytest.raises(TrapsError, match=r"^the host .* of the study lab: its ledger lies in .*s3://BUCKET/STUDY"):
-        require_cluster(workspace, instance)
-    monkeypatch.delenv(RAY, raising=False)
-    with pytest.raises(TrapsError, match=r"^the host .* of the study lab: TRAPS_RAY is not set"):
-        require_cluster(remote, instance)
-    monkeypatch.setenv(RAY, "http://127.0.0.1:1")
-    with pytest.raises(
-        TrapsError, match=r"^the host .* submits no runs of the study lab: nobody.*`traps ui` on the head"
-    ):
-        require_cluster(remote, instance)
 
 
 def test_dagsters_settings_hold_no_address_of_the_database(remote: Workspace) -> None:
@@ -270,23 +199,6 @@ def test_a_run_that_is_asked_for_is_created_once_for_its_own_study(
 
 
 @pytest.mark.slow
-def test_a_host_with_a_wrong_password_names_its_remedy_and_not_the_password(
-    remote: Workspace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
-    with Postgres.running() as server:
-        monkeypatch.setenv("LAB_DATABASE", f"postgresql://traps:a-wrong-word@127.0.0.1:{server.port}/postgres")
-        with (
-            pytest.raises(
-                TrapsError, match=r"history cannot be read .*password authentication.*address, user"
-            ) as raised,
-            dagster_history(remote),
-        ):
-            pass
-    assert "a-wrong-word" not in str(raised.value)
-
-
-@pytest.mark.slow
 def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_started(
     remote: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -331,16 +243,6 @@ def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
         told = [problem for ran in watching.make([], [(None, None)], {}) for problem in ran.problems]
     assert len(submitted) == 2
     assert (told == []) == (times == 1) and all("ended as failure (its host is gone)" in one for one in told)
-
-
-def test_a_run_that_its_node_refuses_is_not_tried_again_and_its_sentence_is_reported(workspace: Workspace) -> None:
-    with dg.DagsterInstance.ephemeral() as instance:
-        watching = RayRuns(instance, workspace, 1, 0.0, "leave")
-        watching._requests = {"r": ([], {})}
-        run = instance.create_run_for_job(_nothing, tags={REQUEST_TAG: "r", REFUSED_TAG: "true"})
-        instance.report_run_failed(run, "the host two has other code than ..")
-        (ran,) = watching._watch(["r"], [])
-    assert ran.problems == ["the host two has other code than .."] and watching._requests
 
 
 @pytest.mark.parametrize("error", [TrapsError("the budget is reached"), ConnectionError("the server is gone")])

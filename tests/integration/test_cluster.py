@@ -6,7 +6,6 @@ import pytest
 
 from tests import objectstore
 from tests.conftest import Checkout
-from tests.lacking import lack, need
 from tests.postgres import LACKING, programs
 
 pytestmark = pytest.mark.slow
@@ -15,11 +14,12 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("in_folder", [False, True])
 def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study(small: Checkout, in_folder: bool) -> None:
     """Tables are those of one process, calls are made once, a second run asks nothing, nodes keep to their folders."""
-    need("ray", "dagster_ray", "dagster_postgres", what="the extra `cluster` is not installed (`make cluster-setup`)")
+    for name in ("ray", "dagster_ray", "dagster_postgres"):
+        pytest.importorskip(name, reason="the extra `cluster` is not installed (`make cluster-setup`)")
     if programs() is None:
-        lack(LACKING)
+        pytest.skip(LACKING)
     if not objectstore.is_installed():
-        lack(objectstore.LACKING)
+        pytest.skip(objectstore.LACKING)
     from bench.cluster_kills import SMALL, kill_each
 
     assert kill_each(["run"], size=SMALL, clips=small.workspace / "clips", in_folder=in_folder) == []

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -91,27 +89,6 @@ def materialize(study: Checkout, stage: str, *keys: str) -> None:
         assert finished.code == 0, finished.err[-3000:]
 
 
-def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> None:
-    before = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
-    question = "Is the hindmost domino lying down when the clip ends, yes or no?"
-    study.correct("domino_chain-0001", question=question)
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
-    # Asked: control and void of `occlusion`, control of `occlusion_ill_posed`. Votes: three judges on abstention for
-    # each, and on correctness for the two controls.
-    assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": (3 + 2) * 3 * EVALUATIONS, "frames": 0}
-    after = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
-    assert (after[0] - before[0], after[1] - before[1]) == (3 * EVALUATIONS, 15 * EVALUATIONS)
-    asked = [row["components"] for row in study.ledger_rows("answers") if row["components"]["user"] == question]
-    assert {components["about"]["item_id"] for components in asked} == {
-        "occlusion:domino_chain-0001:control",
-        "occlusion:domino_chain-0001:void",
-        "occlusion_ill_posed:domino_chain-0001:control",
-    }
-    why = study.traps("why", "occlusion:domino_chain-0001:void").out
-    assert why.count("still stands") == EVALUATIONS
-
-
 @pytest.mark.promise
 def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> None:
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
@@ -167,8 +144,7 @@ def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Che
     materialize(study, "items", "occlusion")
     materialize(study, "responses", "occlusion|oracle__standard__run1")
     assert stale_in_dagster(study) == []
-    rows = re.findall(r"^[a-z_ ]+ +\d+ +(\d+) +(\d+)$", study.traps("status", EXPERIMENT).out, re.MULTILINE)
-    assert len(rows) > 20 and set(rows) == {("0", "0")}  # stale and missing
+    assert study.traps("status", EXPERIMENT).out.endswith(" stages are fresh\n")
 
 
 @pytest.mark.promise
@@ -255,8 +231,3 @@ def _released(study: Checkout, scenario_id: str) -> str:
     family = scenario_id.rsplit("-", 1)[0]
     lines = (study.root / "scene_specs" / "released" / f"{family}.jsonl").read_text().splitlines()
     return next(line for line in lines if json.loads(line)["scenario_id"] == scenario_id)
-
-
-def test_copies_of_the_package_are_what_runs(study: Checkout) -> None:
-    finished = study.run(sys.executable, "-c", "import traps_pipeline.base.paths as p; print(p.ROOT)")
-    assert Path(finished.out.strip()) == study.root

@@ -26,7 +26,6 @@ import pytest
 from tests.build.inside import with_mechanism
 from tests.build.studies import ONE_REGIME, assert_same_tables
 from tests.conftest import Checkout, Finished, copied, copy_workspace, forget_answers
-from tests.lacking import lack
 
 pytestmark = pytest.mark.slow
 MANY = os.environ.get("TRAPS_FAULTS")
@@ -126,7 +125,7 @@ def begun(
 ) -> Campaign:
     """A campaign against a study, which is run once for the number of its calls."""
     if shutil.which("strace") is None:
-        lack("strace is not installed (make campaign installs it)")
+        pytest.skip("strace is not installed (make campaign installs it)")
     start(study)
     log = study.root / "calls"
     finished = traced(study, command, log)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from pathlib import Path
 
 import pytest
@@ -91,9 +90,9 @@ def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_
         f'  - {{id: {name}, base_url: "{url}", key: {KEY}, media: images}}\n' for name, url in address.items()
     )
     path.write_text(f"name: broken\nmodels:\n{models}panel: rules\nscenarios: [domino_chain-0001]\n")
-    study, began = Checkout(ROOT, tmp_path / "study"), time.monotonic()
+    study = Checkout(ROOT, tmp_path / "study")
     finished = study.traps("run", path, "--judged-by-rules")
-    assert time.monotonic() - began < 60 and finished.code == 1  # half a minute where the cores are not shared
+    assert finished.code == 1
     for name, complaint in complaints.items():
         assert any(f"{name}: " in line and complaint in line for line in finished.err.splitlines()), name
     assert "nothing was rendered and nothing was judged" in finished.err

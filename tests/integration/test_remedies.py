@@ -11,9 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.build.records import edit_record
 from tests.build.studies import assert_same_tables
 from tests.conftest import EXPERIMENT, Checkout, Finished
+
+
+def edit_record(study: Checkout, file: str, line: int, **changes: object) -> Path:
+    path = study.root / "scene_specs" / "released" / f"{file}.jsonl"
+    lines = path.read_text().splitlines()
+    lines[line - 1] = json.dumps(json.loads(lines[line - 1]) | changes)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
 
 pytestmark = pytest.mark.slow
 

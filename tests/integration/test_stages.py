@@ -142,13 +142,6 @@ def test_a_stopped_model_leaves_the_other_cells_made_and_the_reason_is_told(stud
         assert made == {"oracle", "random-50", "prior"}
 
 
-def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout) -> None:
-    finished = materialize(study, "responses", "--partition", "occlusion|never-abstain__standard__run1")
-    assert finished.code == 1
-    assert not [key for key in Workspace.open(study.workspace).answers.evaluations() if key.startswith("never-abstain")]
-    assert sum(name.startswith("responses/") for name in known(study)["versions"]) == 4 * 3 * 2
-
-
 def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(own_study: Checkout) -> None:
     tables = Workspace.open(own_study.workspace).tables
     old = tables.state(METRICS, {"dataset": "chaotic"}).code
@@ -220,19 +213,6 @@ with dg.DagsterInstance.get() as history:
 """
     found = study.python("-c", states).out
     assert "('another machine', 'STARTED')" in found and found.count("FAILURE") == 1, found
-
-
-def test_an_unknown_partition_exits_with_one(study: Checkout) -> None:
-    finished = materialize(study, "responses", "--partition", "occlusion|nobody__standard__run1")
-    assert finished.code == 1
-    assert "nobody__standard__run1" in finished.out + finished.err
-
-
-def test_a_missing_upstream_exits_with_one_and_names_it(study: Checkout) -> None:
-    forget_answers(study)
-    finished = materialize(study, "votes", "--partition", CELL)
-    assert finished.code == 1
-    assert "is not made; materialize responses for this partition first" in finished.out + finished.err
 
 
 @pytest.mark.promise

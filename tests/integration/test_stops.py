@@ -73,7 +73,7 @@ def background(tmp_path: Path) -> Iterator[Background]:
         os.kill(pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_no_process_of_the_pages_outlives_the_command(background: Background, stop: signal.Signals) -> None:
     pid = background.traps("ui", "--port", str(background.port), "--token", TOKEN, before="nohup")
     background.wait_until(background.answers)
@@ -94,11 +94,15 @@ def test_no_process_of_a_run_outlives_it(background: Background, stop: signal.Si
     wait_until_gone(background.mark, END_S)
 
 
-def test_the_page_of_reviews_ends(background: Background, small: Checkout) -> None:
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("pages", [("review", "--token", TOKEN), ("annotate",)], ids=lambda words: words[0])
+def test_pages_for_people_end(
+    background: Background, small: Checkout, pages: tuple[str, ...], stop: signal.Signals
+) -> None:
     background.environment["TRAPS_WORKSPACE"] = str(small.workspace)
-    pid = background.traps("review", "--who", "jd", "--port", str(background.port), "--token", TOKEN)
+    pid = background.traps("people", *pages, "--who", "jd", "--port", str(background.port))
     background.wait_until(lambda: _listens(background.port))
-    os.kill(pid, signal.SIGTERM)
+    os.kill(pid, stop)
     wait_until_gone(background.mark, END_S)
 
 

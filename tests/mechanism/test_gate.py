@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from traps_pipeline.mechanism import gating
 from traps_pipeline.mechanism.gate import (
     NEVER,
     OTHER_DATASETS,
@@ -17,6 +18,7 @@ from traps_pipeline.mechanism.gate import (
     thresholds,
 )
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.scoring.bootstrap import figures_of, interval
 
 
 def test_thresholds_are_the_ones_worked_out() -> None:
@@ -47,6 +49,18 @@ def test_gating_turns_answers_into_abstentions_and_nothing_else() -> None:
     twice = np.array([[2, 0, 1, 1, 0, 1, 1, 2.0]])  # a resample: the first control twice, the second not at all
     drawn = outcomes.figures(twice)
     assert drawn["acc"].tolist() == pytest.approx([2 / 3]) and drawn["abs_rec"].tolist() == [0.0]
+
+
+@pytest.mark.parametrize("n", [2, 12, 200])
+@pytest.mark.parametrize("right", [0.0, 1.0])
+def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(n: int, right: float) -> None:
+    void = np.tile([False, True], n)
+    outcomes = Outcomes(void, np.where(void, np.nan, right), np.where(void, right, 0.0))
+    names = np.repeat([f"occlusion-{number:03d}" for number in range(n)], 2)
+    figures = figures_of(gating._resampled(outcomes, "occlusion", names, 2000, 1))
+    low, high = interval(figures[:, gating._PECS, 1:], right, (0.0, 1.0))
+    outermost = 0.025 ** (1 / n)  # Clopper and Pearson's lower end of n of n; .74 for 12
+    assert low <= outermost + 0.02 and high == 1.0 if right else low == 0.0 < high
 
 
 def test_risk_falls_as_the_riskiest_answers_are_given_up() -> None:

@@ -19,11 +19,9 @@ from tests.build.mechanism import STANDARD, entry, extract_all, own, patch, stud
 from tests.conftest import ROOT
 from tests.mechanism.steer_cell import CELL
 from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
-from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
-from traps_pipeline.mechanism.baselines import baseline_rows
 from traps_pipeline.mechanism.cosines import cosine_rows
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
@@ -416,46 +414,6 @@ def test_nulls_and_policies_stand_beside_every_own_direction(steered: Workspace)
     assert set(pecs.query("signs == 'plus'")["source"]) == set(DATASETS)
     label, plus = (pecs.query(f"signs == '{s}' and source == target").reset_index(drop=True) for s in ("label", "plus"))
     assert (label["acc"].dropna() == plus["acc"].dropna()).all()  # controls are the same under both policies
-
-
-def test_other_interventions_and_probes_stand_in_the_tables_like_the_built_in_ones(
-    own: Workspace, entry: ModelEntry
-) -> None:
-    """Project out and clamp are asked, judged and counted as steered answers are; other probes beside the baselines."""
-    settings = own.mechanism
-    assert settings.steering is not None
-    changed = settings.steering.model_copy(update={"alphas": (2.0,), "project_out": (1.0,), "clamp": (-0.5, 2.0)})
-    probes = settings.probes.model_copy(update={"others": ("mean difference", "LinearSVC")})
-    own = own.allow(mechanism=settings.model_copy(update={"steering": changed, "probes": probes}))
-    cells = [SteeringCell.make("chaotic", "tiny", "standard", "guided")]
-    along = {"standard": stages.saved_directions(own, STANDARD)}
-    ((_, done),) = written(own, STEERING, collect_steered(own, entry, cells, along))
-    # 4 sources x 2 doses x 4 rows; + on both sides, of which the controls are there; 3 interventions x 4; 2 nulls x 4
-    # at the largest dose; the sweep's 2 controls; 4 rows as they are
-    assert done.shown["wanted"] == 32 + 4 + 12 + 8 + 2 + 4
-    with_others, without = (
-        count_answers(of, "tiny", ["chaotic"], {"chaotic": PAIRS})["guided"].total() for of in (own.mechanism, settings)
-    )
-    assert with_others - without == 12 - 4 - 2 - 2  # without one alpha: 4 rows by label, 2 voids by +, 2 of the sweep
-    written(own, STEERING_VOTES, collect_steering_votes(own, cells))
-    answers, votes = own.tables.read_all(STEERING), own.tables.read_all(STEERING_VOTES)
-    effects = pd.DataFrame([vars(row) for row in effect_rows(answers, votes)])
-    doses = [("project out", 0.0), ("project out", 1.0), ("clamp", -0.5), ("clamp", 0.0), ("clamp", 2.0)]
-    for unit, dose in doses:
-        there = effects.query(f"unit == '{unit}' and dose == {dose}")
-        void, control = (there.query(f"side == '{side}'") for side in ("void", "control"))
-        assert len(void) == len(control) == 1 and set(void["signs"]) == {"plus"}
-        assert void["n"].item() + void["n_missing"].item() == control["n"].item() + control["n_missing"].item() == 2
-    gap = along["standard"]["chaotic"].gaps[2]
-    assert set(effects.query("unit == 'clamp' and dose == 2")["alpha"]) == {float(2 * gap)}
-    assert set(effects.query("unit == 'project out'")["alpha"]) == {0.0}
-    assert len(of_paper(answers).query("alpha > 0")["unit"].unique()) == 1  # the paper's figures see alphas alone
-
-    found = pd.DataFrame([vars(row) for row in baseline_rows(own, entry, StoredStates.of(own, STANDARD))])
-    assert {"states, mean difference", "states, LinearSVC", "question words"} <= set(found["features"])
-    theirs = inside.protocol(own, "tiny", layer=2, fit="mean difference")
-    ours = found.query("features == 'states, mean difference'")
-    assert list(ours["value"]) == list(theirs["value"]) and list(ours["low"]) == list(theirs["low"])
 
 
 def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace) -> None:

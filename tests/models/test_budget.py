@@ -91,17 +91,6 @@ def test_two_hundred_connections_never_spend_a_cent_above_the_cap() -> None:
     assert 9.0 - 0.05 <= most <= 9.0 + 1e-9  # used up to the last call's worst case, never above
 
 
-def test_a_models_own_cap_stops_it_and_not_the_others() -> None:
-    async def run() -> None:
-        budget = budget_of(10.0, {"m": 0.10})
-        await budget.settle(await budget.reserve("m", 0.06), 0.06)
-        with pytest.raises(BudgetReached, match=r"budget of m is reached: \$0\.06 of \$0\.10 spent"):
-            await budget.reserve("m", 0.06)
-        await budget.reserve("other", 0.06)
-
-    asyncio.run(run())
-
-
 def test_an_unknown_cost_counts_as_the_worst() -> None:
     async def run() -> float:
         budget = budget_of(1.0)

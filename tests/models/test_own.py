@@ -64,14 +64,14 @@ def test_elsewhere_the_price_is_unknown_until_it_is_given_and_a_departure_from_t
     text = MINE.replace("http://127.0.0.1:8000", "https://example.org")
     load_experiment(written(tmp_path, text))
     assert get_model("my-model").prices is None
-    with raises(TrapsError, "base.yamlfile.within"):
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model"):
         load_experiment(written(tmp_path, text.replace("media: images", "media: images\n    params: {temperature: 0}")))
 
 
 def test_a_parameter_that_a_server_refuses_is_left_out_by_null(tmp_path: Path) -> None:
     lines = "media: images\n    params: {temperature: null, top_p: null, max_completion_tokens: 8000}\n"
     load = MINE.replace("media: images\n", lines)
-    with raises(TrapsError, "base.yamlfile.within"):
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model"):
         load_experiment(written(tmp_path, load))
     waived = lines + "    waivers: {temperature: refused, top_p: refused}\n"
     load_experiment(written(tmp_path, MINE.replace("media: images\n", waived)))
@@ -124,5 +124,5 @@ def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypa
     ],
 )
 def test_a_wrong_entry_of_ones_own_is_named_with_its_field(tmp_path: Path, old: str, new: str) -> None:
-    with raises(TrapsError, "base.yamlfile"):
+    with raises(TrapsError, "", "mine.yaml"):
         load_experiment(written(tmp_path, MINE.replace(old, new)))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.calls import entry_of
 from tests.build.ledger import write
-from tests.models.test_budget import PRICED
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.ledger.money import Money, Releasable
@@ -42,7 +42,7 @@ def in_flight(workspace: Workspace, participant: str) -> None:
 
 def room_for(workspace: Workspace, dollars: float) -> bool:
     """Whether a call of so many dollars fits into the study's budget."""
-    with spending(workspace, [PRICED]) as budget:
+    with spending(workspace, [entry_of("m")]) as budget:
         try:
             reservation = asyncio.run(budget.reserve("m", dollars))
         except BudgetReached:
@@ -90,7 +90,7 @@ def test_an_account_that_several_studies_share_gets_the_money_back_too(blocked: 
 def test_the_command_lists_and_releases_and_wants_a_reason(
     blocked: Workspace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["ledger", "release", "--workspace", str(blocked.root)]
+    command = ["study", "release-money", "--workspace", str(blocked.root)]
     assert main(command) == 0
     assert capsys.readouterr().out.splitlines()[1].split() == ["m", "1.0000", "3.0000"]
     assert main([*command, "--participant", "m", "--all-in-flight"]) == 1

@@ -12,7 +12,6 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.protocol.datasets import DATASETS, datasets_of_category
-from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.doses import DATASETS_READ, RULES
 from traps_pipeline.storage.study import Study
 
@@ -20,13 +19,6 @@ from traps_pipeline.storage.study import Study
 def experiment(tmp_path: Path, text: str) -> str:
     (tmp_path / "my.yaml").write_text("name: my\nmodels: [oracle, random-50]\n" + text)
     return str(tmp_path / "my.yaml")
-
-
-def test_the_demo_is_eight_reference_models_by_three_regimes_on_32_named_scenarios() -> None:
-    demo = load_experiment("demo")
-    assert len(demo.models) == 9 and demo.regimes == list(REGIMES) and demo.runs == [1]
-    assert demo.scenarios is not None and len(set(demo.scenarios)) == 32
-    assert len(demo.cells()) == 9 * 3 * 1 * 4
 
 
 def test_all_datasets_and_regimes_are_asked_where_none_is_named_and_a_model_has_no_more_runs_than_it_has(

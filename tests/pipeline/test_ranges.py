@@ -8,7 +8,7 @@ from typing import Any
 
 import dagster as dg
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from traps_pipeline.pipeline.partitioning import Scheme
@@ -33,6 +33,7 @@ def grid_of(n_datasets: int, n_evaluations: int) -> Scheme:
 GRID = grid_of(6, 20)
 
 
+@settings(deadline=None)  # a busy machine takes any time
 @given(keys=st.sets(st.sampled_from(sorted(GRID.keys)), min_size=1), most=st.integers(1, 50))
 def test_whatever_is_missing_no_more_runs_than_asked_have_each_key_once(keys: set[str], most: int) -> None:
     ranges = cut(GRID, sorted(keys), most)
@@ -42,6 +43,7 @@ def test_whatever_is_missing_no_more_runs_than_asked_have_each_key_once(keys: se
     assert all(keys & {*keys_of(GRID, [one])} for one in ranges)
 
 
+@settings(deadline=None)  # a busy machine takes any time
 @given(keys=st.sets(st.sampled_from(sorted(GRID.keys)), min_size=60), most=st.integers(2, 12))
 def test_runs_of_any_pattern_of_holes_have_about_as_much_to_do(keys: set[str], most: int) -> None:
     evaluations = {key.partition("|")[2] for key in keys}
@@ -107,6 +109,7 @@ def test_a_large_category_is_made_by_more_runs_than_a_small_one() -> None:
     }  # fmt: skip
 
 
+@settings(deadline=None)  # a busy machine takes any time
 @given(corners=st.tuples(st.sampled_from(GRID.keys), st.sampled_from(GRID.keys)))
 def test_a_range_has_the_keys_that_dagster_reads_in_it(corners: tuple[str, str]) -> None:
     assert [*GRID.between(*corners)] == keys_of(GRID, [corners])

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from dagster import AssetObservation, PartitionKeyRange
 
-from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import dagster_history
@@ -81,12 +80,3 @@ def test_a_history_that_is_lost_begins_anew(
     with dagster_history(workspace) as history:
         assert history.all_asset_keys() == [] and history.get_runs_count() == 0
     assert ("history was damaged; it lies in broken-" in capsys.readouterr().err) == (damage != "gone")
-
-
-def test_a_file_in_the_place_of_dagsters_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    workspace = Workspace.create(tmp_path / "study", Study())
-    monkeypatch.delenv("DAGSTER_HOME", raising=False)
-    workspace.dagster_home.rmdir()
-    workspace.dagster_home.touch()
-    with pytest.raises(TrapsError, match=r"a file.* move that"), dagster_history(workspace):
-        pass

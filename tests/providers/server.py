@@ -77,7 +77,7 @@ FAILURES: dict[str, Failure] = {
     ),
 }
 ENDINGS = ("empty", "length", "thinking_exhausted", "content_filter", "refusal", "invalid_json")  # 200, but no answer
-DISTURBANCES = ("hang", "cut", "slow", "wrong_content_type")
+DISTURBANCES = ("hang", "cut", "wrong_content_type")
 FAULTS = (*FAILURES, *ENDINGS, *DISTURBANCES)
 _LASTING = {"bad_request", "unauthorized", "forbidden", "not_found", "content_filter_error"}
 TRANSIENT = frozenset(FAULTS) - frozenset(ENDINGS) - _LASTING  # what `only_first_attempts` ends
@@ -89,8 +89,7 @@ class Config:
 
     fault_by_model always applies (null: that model never fails). only_first_attempts: transient faults of `faults`
     spare a body that was seen that often. scripts: by model, what it says to a request whose text holds a phrase (the
-    first that fits), in the place of a good answer. Latency delays 200s only, error statuses come at once; `slow_s`
-    replaces it.
+    first that fits), in the place of a good answer. Latency delays 200s only, error statuses come at once.
     raw_by_model: the very bytes (`content`), `status`, `type` and `headers` of what a model answers, and whether it is
     `billed`. fuzzed: answers of the chat
     API come with a few of their values, or their end, replaced. usd_a_token: what the server bills for prompt and
@@ -108,7 +107,6 @@ class Config:
     only_first_attempts: int | None = None
     scripts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     retry_after_s: float = 0.05
-    slow_s: float = 10.0
     hang_s: float = 300.0
     served_suffix: str = ""
     raw_by_model: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -594,7 +592,6 @@ class Tallies:
 
     requests: int = 0
     billed_usd: float = 0.0
-    max_in_flight: int = 0
     by_status: Counter[str] = field(default_factory=Counter)
     by_fault: Counter[str] = field(default_factory=Counter)
     answered_by_fault: Counter[str] = field(default_factory=Counter)
@@ -617,7 +614,6 @@ class Tallies:
             "by_status": dict(self.by_status),
             "by_fault": dict(self.by_fault),
             "answered_by_fault": dict(self.answered_by_fault),
-            "max_in_flight": self.max_in_flight,
         }
 
 
@@ -673,10 +669,9 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
         number = int.from_bytes(hashlib.sha256(question.text.encode()).digest()[:8], "big")
         tokens = body["usage"]["prompt_tokens"], body["usage"]["completion_tokens"]
         return Reply(200, fuzz(body, number), delay_s=config.latency_s, tokens=tokens)
-    waits = {"slow": config.slow_s, "hang": config.hang_s}
     return json_reply(
         body,
-        delay_s=waits.get(fault or "", config.latency_s),
+        delay_s=config.hang_s if fault == "hang" else config.latency_s,
         cut=fault in ("cut", "hang"),
         tokens=(question.prompt_tokens, sum(_usage(question, ending)[1:]) + REASONING_TOKENS),
     )
@@ -696,7 +691,6 @@ class Server:
         tallies = self._tallies  # a reset meanwhile starts others
         self._in_flight += 1
         tallies.requests += 1
-        tallies.max_in_flight = max(tallies.max_in_flight, self._in_flight)
         try:
             return await self._provide(request, tallies)
         finally:
@@ -749,7 +743,7 @@ class Server:
             case "GET", "/_stats":
                 return json_reply(self._tallies.report() | {"in_flight": self._in_flight})
             case "POST", "/_reset":
-                self._tallies = Tallies(max_in_flight=self._in_flight)
+                self._tallies = Tallies()
                 return json_reply({})
             case "POST", "/_config":
                 return self._configure(await request.content.read())

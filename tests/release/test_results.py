@@ -11,8 +11,6 @@ import yaml
 
 from tests.conftest import Checkout
 from tests.release.environments import run_in
-from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
@@ -22,7 +20,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def written(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
-    finished = small.traps("results", folder, "--dataset", "owner/traps", "--organization", "A lab")
+    finished = small.traps("publish", "results", folder, "--dataset", "owner/traps", "--organization", "A lab")
     assert finished.code == 0 and finished.out.startswith("7 files in"), finished.err
     return folder
 
@@ -39,11 +37,6 @@ def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: C
         scores = {one["evaluation_result_id"]: one["score_details"]["score"] for one in record["evaluation_results"]}
         for name in ("pecs", "acc", "abs_rec", "false_abs", "j"):
             assert scores[f"trapsbench/{row['regime']}/{name}"] == row[name]
-
-
-def test_a_name_that_is_no_repository_is_refused(small: Checkout, tmp_path: Path) -> None:
-    with pytest.raises(TrapsError, match="write it as OWNER/NAME"):
-        write_results(Workspace.open(small.workspace), tmp_path, "traps", Who())
 
 
 def test_the_hubs_library_reads_the_results(written: Path) -> None:

@@ -33,9 +33,6 @@ def unasked_copy(small: Checkout, tmp_path: Path) -> Workspace:
     return Workspace.open(tmp_path / "study")
 
 
-# --- arguments --------------------------------------------------------------------------------------------------------
-
-
 # --- exports and imports ----------------------------------------------------------------------------------------------
 
 

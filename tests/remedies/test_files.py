@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.remedies.remedied import remedied
-from traps_pipeline.base.files import require_in_place, try_lock, write_text
+from traps_pipeline.base.files import write_text
 
 
 def written(path: Path, text: str = "x") -> Callable[[], str]:
@@ -104,19 +104,3 @@ def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, in_the_way: str) -> 
     else:
         path.mkdir(parents=True)
     remedied(written(tmp_path / "f" / "a.txt"), "base.files.replacing", lambda: path.rename(tmp_path / "away"))
-
-
-def test_a_run_whose_lock_file_was_removed_is_run_again(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    held = try_lock(path)
-    assert held is not None
-    path.unlink()
-
-    def again() -> None:
-        new = try_lock(path)
-        assert new is not None
-        require_in_place(new, path)
-        os.close(new)
-
-    remedied(lambda: require_in_place(held, path), "base.files.require_in_place", again=again)
-    os.close(held)

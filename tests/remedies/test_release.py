@@ -1,4 +1,4 @@
-"""What errors about what is published, submitted and committed to say to do lets the same command succeed."""
+"""What errors about what is published and submitted say to do lets the same command succeed."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.build.commitments import committed
 from tests.conftest import Checkout
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.release.checksums import CHECKSUMS
-from traps_pipeline.release.commitment import commit, read_commitment
 from traps_pipeline.release.content import content_of, pair_rows
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.results import Who, write_results
@@ -22,7 +20,6 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-__all__ = ["committed"]  # the fixture
 
 
 @pytest.fixture(scope="module")
@@ -126,38 +123,12 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     assert told in verify(submission).unchecked
     assert told not in verify(submission, release).unchecked
     remedied(
-        lambda: command("verify", path, "--key", tmp_path / "key.pub"),
+        lambda: command("publish", "verify", path, "--key", tmp_path / "key.pub"),
         "cli.release.verify",
-        again=lambda: command("verify", path),
+        again=lambda: command("publish", "verify", path),
     )
     root = tmp_path / "study"
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
     votes = root / "tables" / "votes"
     aside = votes.rename(tmp_path / "aside")
     remedied(lambda: pack(Workspace.open(root), path, "small"), "release.submission.pack", lambda: aside.rename(votes))
-
-
-def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(committed: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(committed, tmp_path / "copy"))
-    remedied(
-        lambda: commit(copy / "private", copy / "commitment.json", tmp_path / "reveal.json"),
-        "release.commitment.commit",
-        again=lambda: commit(copy / "private", tmp_path / "commitment.json", tmp_path / "reveal.json"),
-    )
-    remedied(
-        lambda: read_commitment(tmp_path / "none.json"),
-        "release.commitment",
-        again=lambda: read_commitment(tmp_path / "commitment.json"),
-    )
-    (copy / "private" / "released" / "draws.json").unlink()
-    remedied(
-        lambda: commit(copy / "private", tmp_path / "c.json", tmp_path / "r.json"),
-        "release.commitment.commit",
-        again=lambda: commit(committed / "private", tmp_path / "c.json", tmp_path / "r.json"),
-    )
-    files = [copy / "commitment.json", copy / "reveal.json"]
-    remedied(
-        lambda: command("verify-commitment", *files, "--without-drawing"),
-        "cli.release.verify_commitment",
-        again=lambda: command("verify-commitment", *files, "--without-drawing", "--specs", committed / "private"),
-    )

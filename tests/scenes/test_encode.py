@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import base64
-import errno
 import hashlib
-import os
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -124,26 +120,6 @@ def test_a_failure_while_encoding_leaves_the_former_clip_and_no_part(clip: Path)
         encode([*frames(5), np.zeros((7, 7), np.uint8)], clip, 10)
     assert clip.read_bytes() == before
     assert [path.name for path in clip.parent.iterdir()] == ["clip.mp4"]
-
-
-def test_a_full_disk_is_named_with_the_remedy_and_leaves_no_part(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = clip.read_bytes()
-
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "replace", full)
-    with raises(TrapsError, "base.files.replacing", "clip.mp4"):
-        encode(frames(3), clip, 10)
-    assert clip.read_bytes() == before
-    assert [path.name for path in clip.parent.iterdir()] == ["clip.mp4"]
-
-
-def test_a_disk_that_is_really_full_is_named_too(tiny_disk: Path) -> None:
-    noise: Sequence[np.ndarray] = np.random.default_rng(0).integers(0, 255, size=(20, 120, 160, 3), dtype=np.uint8)
-    with pytest.raises(TrapsError, match=r"clip\.mp4: cannot be written .*free some space"):
-        encode(noise, tiny_disk / "clip.mp4", 10)
-    assert list(tiny_disk.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,12 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from tests.build.families import PAGE, Add, add
+from tests.conftest import ROOT
 from tests.scenes.released import Released
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
+from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes import family_registry as registry
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.resolve import Resolved
@@ -25,7 +28,39 @@ from traps_pipeline.scenes.parts.independence import dependence
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family
 
-__all__ = ["add"]  # fixtures
+(PAGE,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL | re.MULTILINE)
+
+
+Add = Callable[..., None]
+
+
+def forget() -> None:
+    for cached in (registry.family_names, registry.get_family, registry.families, registry.fit_to_sample):
+        cached.cache_clear()
+    family_asking.cache_clear()
+
+
+@pytest.fixture
+def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Add]:
+    """Adds a family file beside the others for one test: the page's, with some of its text replaced."""
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
+    added: list[str] = []
+
+    def add(name: str, **changes: Sequence[str]) -> None:
+        text = PAGE.replace('"plank_post"', f'"{name}"')
+        for old, new in changes.values():
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / f"{name}.py").write_text(text)
+        added.append(name)
+        forget()
+
+    yield add
+    monkeypatch.undo()
+    for name in added:
+        sys.modules.pop(f"{package.__name__}.{name}", None)
+    forget()
+
 
 # --- the family of the page -------------------------------------------------------------------------------------------
 

@@ -11,20 +11,21 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.stores import database, opened, where
 from tests.build.video_rows import clip
 from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import object_name
-from traps_pipeline.cluster.database import Database
-from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
+from traps_pipeline.cluster.objects import OBJECTS, ObjectStore
 from traps_pipeline.cluster.places import SharedFolder
 from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
 
+__all__ = ["where"]  # a fixture
 PLINKO = {"category": "plinko"}
 
 
@@ -56,30 +57,6 @@ def _hosts_of_bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Callable
     postgres: Postgres = request.getfixturevalue("postgres")
     study = f"study-{secrets.token_hex(4)}"
     return lambda name: opened(str(tmp_path), postgres.address(), study, name)
-
-
-@pytest.fixture(params=["folder", pytest.param("objects", marks=pytest.mark.slow)])
-def where(request: pytest.FixtureRequest, tmp_path: Path) -> Sequence[str]:
-    """What `opened` is told of a study."""
-    if request.param == "folder":
-        return [str(tmp_path)]
-    request.getfixturevalue("s3")
-    return [str(tmp_path), request.getfixturevalue("postgres").address(), f"study-{secrets.token_hex(4)}"]
-
-
-def opened(folder: str, *of_database: str) -> Store:
-    """A study's files below a folder, as the host of the last name sees them; with the address of a database and the
-    study's name before that, in a bucket."""
-    *where, host = of_database
-    if not where:
-        return FolderStore(Path(folder) / "study")
-    address, study = where
-    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database(address, study), study, b"anchor")
-
-
-def database(address: str, study: str) -> Database:
-    """The database of a study, as a process of its own has it."""
-    return Database(address, "TRAPS_TEST_DATABASE", study)
 
 
 def put(store: Store, name: str, content: bytes) -> Path:
@@ -191,7 +168,7 @@ def test_a_piece_of_work_is_one_processs_until_it_is_given_back(hosts: Hosts) ->
 HOLDING = """
 import os, sys, time
 from pathlib import Path
-from tests.storage.test_store import opened
+from tests.build.stores import opened
 store = opened(*sys.argv[1:])
 lease = store.lease("work")
 print("held" if lease else "not held", flush=True)

@@ -42,8 +42,7 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import encode
 
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
-TIMEOUT_S = 25.0  # of a call; what is wrong is named within half a minute
-REACH_S = 8.0
+TIMEOUT_S, REACH_S = 25.0, 5.0  # of a call, of what is looked at before: what is wrong is named within half a minute
 BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"

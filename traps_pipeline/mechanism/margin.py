@@ -72,6 +72,6 @@ def head_logits(model: LocalModel, normed: Tensor) -> Tensor:
     import torch
 
     head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()
-    logits = head(normed.to(model.device, model.network.dtype)).float()
+    logits = head(normed.to(head.weight.device, model.network.dtype)).float()
     cap = getattr(config, "final_logit_softcapping", None)
     return torch.tanh(logits / cap) * cap if cap else logits

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
 )
 from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.probing_versions import states_folder
+from traps_pipeline.mechanism.probing_versions import shown_inside, states_folder
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
@@ -52,7 +52,8 @@ COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "questio
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """The entry of a model in the study's `mechanism` section. Raises TrapsError if it is not local, or not there."""
+    """Return the entry of a model in the study's `mechanism` section, with the media that it is shown there. Raises
+    TrapsError if it is not local, or not there."""
     entry, settings = get_model(model), workspace.mechanism
     if entry.backend != LOCAL:
         local = ", ".join(name for name in settings.models if get_model(name).backend == LOCAL) or "none of the study's"
@@ -62,7 +63,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
         )
     if model not in settings.models:
         raise TrapsError(f"study.yaml: mechanism.models does not name {model}; add it with its layers")
-    return entry
+    return shown_inside(entry, settings)
 
 
 # --- hidden states ----------------------------------------------------------------------------------------------------

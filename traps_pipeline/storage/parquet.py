@@ -297,9 +297,15 @@ def _sum_of(content: bytes) -> bytes:
     return b"%08x" % crc32(view[place + len(_ZEROS) :], crc32(_ZEROS, crc32(view[:place])))
 
 
-def _sound_bytes(path: Path) -> io.BytesIO:
-    """A file's bytes, if they are what was written. Raises TrapsError if not. The bytes that this process has looked at
-    are not looked at again while size and time are the same."""
+def _sound_bytes(path: Path) -> pa.BufferReader:
+    """Return a file's bytes if they are what was written. Raises TrapsError if not. The bytes that this process has
+    checked are not checked again while size and time are the same.
+
+    Arrow's threads read a buffer without Python: with a file object of Python's they may meet an interpreter that is
+    ending, and abort or hang (https://github.com/apache/arrow/issues/50482).
+    """
+    import pyarrow as pa
+
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
     place = content.rfind(_MARK) + len(_MARK)
@@ -307,7 +313,7 @@ def _sound_bytes(path: Path) -> io.BytesIO:
         if place < len(_MARK) or content[place : place + len(_ZEROS)] != _sum_of(content):
             raise TrapsError(f"{path}: is not what was written (it was altered); run again, and it is made anew")
         _WHOLE[path] = stamp
-    return io.BytesIO(content)
+    return pa.BufferReader(content)
 
 
 def _footer_of(path: Path) -> tuple[State, list[str]]:
