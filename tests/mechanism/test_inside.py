@@ -16,6 +16,7 @@ from sklearn.preprocessing import StandardScaler
 
 from tests.conftest import ROOT
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_verdicts
+from tools.inside_notebook import cells, execute
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
@@ -67,8 +68,7 @@ def test_the_page_runs_as_it_is_written(study: Workspace) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     code = "\n".join(blocks).replace('".workspaces/mechanism"', repr(str(study.root))).replace('"pocket"', '"tiny"')
     assert len(blocks) >= 6
-    names: dict[str, object] = {}
-    exec(compile(code, "docs/inside.md", "exec"), names)
+    names = execute(cells(f"```python\n{code}```\n"))
     assert not torch.equal(names["pushed"], names["plain"])  # type: ignore[arg-type]
 
 

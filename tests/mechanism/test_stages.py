@@ -432,7 +432,10 @@ def test_settings_that_cannot_be_are_refused() -> None:
     for wrong, message in (
         ({"models": {}}, "at least 1"),
         ({"models": layers, "probes": {"shuffles": 5}}, "greater than or equal to 20"),
-        ({"models": layers, "prompts": ["standard"]}, "are not among the prompts"),
+        (
+            {"models": layers, "prompts": ["standard"], "steering": {"direction_regimes": ["guided"]}},
+            "are not among the prompts",
+        ),
         (
             {"models": layers, "prompts": ["standard"], "steering": None, "probes": {"prompts": ["guided"]}},
             "probes.prompts: .'guided'. are not among the prompts",

@@ -253,7 +253,7 @@ PARAMS = "checkpoint: a/b, dtype: float32, quantisation: none, do_sample: false,
         (f"{LOCAL}, device: cpu, params: {{{PARAMS}, temperature: 0.8}}", "params: do_sample: false is greedy"),
         (f"{LOCAL}, device: cpu, params: {{{PARAMS.replace('false', 'true')}}}", "params: do_sample: true needs"),
         (f"{LOCAL}, device: cpu, params: {{{PARAMS}, nf4_skip: [lm_head]}}", "params: nf4_skip goes with"),
-        ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism: only backend local"),
+        ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism, size: only backend local"),
         (
             f"{LOCAL}, device: cpu, params: {{{PARAMS}}}, mechanism: {{nf4_skip: [lm_head]}}",
             "mechanism: nf4_skip goes with",
