@@ -23,7 +23,7 @@ import pandas as pd
 from scipy.stats import norm
 
 from bench.quick import parse
-from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     TAXONOMIES,
@@ -39,8 +39,7 @@ from traps_pipeline.scoring.bootstrap import (
     with_unseen,
 )
 from traps_pipeline.scoring.metrics import pecs_of
-from traps_pipeline.scoring.robust import FIGURES as OF_ROBUST
-from traps_pipeline.scoring.robust import WITH_CONTROLS, WITH_VOIDS, run_figures
+from traps_pipeline.scoring.robust import robust_ends
 
 SIZES = {
     "1": (1, 0),
@@ -68,13 +67,13 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 1 run": (0.5, 0.3, 0.6, 1),
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
-ARMS = ("decoy", "frame_out", "held_void", "twin_control")
+ARMS = ("decoy", "length_matched", TWIN, CROSSED)
 STUDIES, RESAMPLES, PARTS = 25, 1000, 12
 N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED),
     *RESAMPLED,
-    "pecs_r",
+    "robust",
     "difference of j",
     "difference of pecs",
 )
@@ -102,7 +101,7 @@ class Setting:
         pecs = float(pecs_of(np.asarray(acc), np.asarray(abs_rec - false_abs)))
         known = {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": abs_rec - false_abs, "pecs": pecs}
         of_one = {f"{name}, one dataset": value for name, value in known.items()}
-        return {**of_one, **known, "pecs_r": pecs, "difference of j": 0.0, "difference of pecs": 0.0}
+        return {**of_one, **known, "robust": pecs, "difference of j": 0.0, "difference of pecs": 0.0}
 
     def _share(self, share: float, way: int) -> float:
         return float(norm.cdf(norm.ppf(share) + way * self.families).mean())
@@ -149,8 +148,11 @@ def ends_now(counts: Mapping[str, np.ndarray], drawn: Drawn, model: str) -> dict
     inside = {name: ends_of(name, in_mean=True) for name in counts}
     overall = np.mean([inside[name] for name in DATASETS], axis=0)
     ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED)}
-    robust = [run_figures({name: own[study] for name, own in inside.items()}, ARMS) for study in range(len(overall))]
-    return ends | {"pecs_r": np.stack(robust)[:, :, OF_ROBUST.index("pecs_r")]}
+    scenarios = {name: int((own[..., 1] > 0).any(axis=(1, 2)).sum()) for name, own in counts.items()}
+    robust = [
+        robust_ends({name: own[study] for name, own in inside.items()}, scenarios) for study in range(len(overall))
+    ]
+    return ends | {"robust": np.stack(robust)}
 
 
 def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -173,10 +175,10 @@ def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndar
 
     def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
         k = RESAMPLED.index(figure)
-        return np.nanmean([overall[k], *(figures[arm][k] for arm in ARMS if arm in of)], axis=0)
+        return np.nanmean([overall[k], *(figures[arm][k] for arm in of)], axis=0)
 
-    acc, false_abs = (mean_over_kinds(figure, WITH_CONTROLS) for figure in ("acc", "false_abs"))
-    return draws | {"pecs_r": pecs_of(acc, mean_over_kinds("abs_rec", WITH_VOIDS) - false_abs)}
+    acc, false_abs = (mean_over_kinds(figure, ARMS) for figure in ("acc", "false_abs"))
+    return draws | {"robust": pecs_of(acc, mean_over_kinds("abs_rec", (CROSSED,)) - false_abs)}
 
 
 def _taxonomy(name: str) -> str:
@@ -194,8 +196,7 @@ def drawn_counts(setting: Setting, rng: np.random.Generator, studies: int) -> di
     for arm in ARMS:
         if arm in counts:
             counts[arm][np.arange(len(counts[arm])) // N_FAMILIES % ARM_SHARE != 0] = 0
-            counts[arm][..., 4:] *= arm in WITH_VOIDS
-            counts[arm][..., :4] *= arm in WITH_CONTROLS
+            counts[arm][..., 4:] *= arm == CROSSED
     return counts
 
 
@@ -244,7 +245,7 @@ def mean_of_parts(setting: Setting, parts: int, seed: int) -> pd.DataFrame:
 
 def summary(rows: pd.DataFrame) -> str:
     """Return the Markdown table of lowest coverage and mean width by size and figure, before and now."""
-    shown = ("j, one dataset", "acc", "j", "pecs", "pecs_r", "difference of pecs")
+    shown = ("j, one dataset", "acc", "j", "pecs", "robust", "difference of pecs")
     lines = ["| scenarios | " + " | ".join(shown) + " |", "| --- " * (len(shown) + 1) + "|"]
     for size in SIZES:
         cells = []

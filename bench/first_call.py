@@ -142,9 +142,9 @@ def main() -> None:
             began = time.perf_counter()
             file = Path(name) / "moved.sqlite"
             study_yaml = study.workspace / "study.yaml"
-            exported = study.traps("ledger", "export", str(file))
+            exported = study.traps("study", "export-ledger", str(file))
             study_yaml.write_text(f"{study_yaml.read_text()}database: {DATABASE}\n")
-            moved = study.traps("ledger", "import", str(file))
+            moved = study.traps("study", "import-ledger", str(file))
             assert exported.code == moved.code == 0, exported.err + moved.err
             print(f"moved into PostgreSQL in {time.perf_counter() - began:.1f} s", flush=True)
         path = experiment(study, ["image-model"], regimes=["standard"])

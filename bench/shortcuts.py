@@ -7,7 +7,7 @@ question names shows there (certificate `referents`); when outcomes settle, and 
 records of a family have a neighbour whose first frame looks like theirs; how far each seesaw turns; how well the state
 at the cut predicts the outcome of a chaotic record, beside always saying the commonest outcome. With --observer also
 what the observer reads of each whole control, encoded and decoded (eight minutes more). From a study that asked the
-arms (`traps run arms`): PECS, PECS-R and the gap of the shortcut rules and of the observer.
+arms (`traps run arms`): PECS, conjunction, robust figure and inference of the shortcut rules and of the observer.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def main() -> None:
     print_seesaws(found)
     print_states(found)
     if arguments.workspace is None:
-        print("\nPECS-R: not run; name a study of assets/experiments/arms.yaml with --workspace")
+        print("\nArms: not run; name a study of assets/experiments/arms.yaml with --workspace")
     else:
         print_rules(Workspace.open(arguments.workspace))
 
@@ -134,7 +134,7 @@ def measure(spec: SceneSpec, folder: Path, whole: bool = False) -> Measured:
 
 
 def given(certificate: Certificate, spec: SceneSpec) -> bool:
-    """Whether the record's own evidence carries a certificate; `traps certify` measures that evidence again."""
+    """Whether the record's own evidence carries a certificate; `traps benchmark certify` measures it again."""
     return certificate.failure(stored_evidence(spec), Claim.of_record(spec)) is None
 
 
@@ -248,11 +248,10 @@ def print_rules(workspace: Workspace) -> None:
     board = workspace.tables.read(LEADERBOARD, {}).query("dataset == 'overall'")
     robust = workspace.tables.read(ROBUST, {})
     both = board.merge(robust, on=["model", "regime"], suffixes=("", "_robust")).sort_values("model")
-    print(
-        "\nPECS, PECS-R and the shortcut gap (target: PECS-R of each rule at most 0.25, of the observer at least 0.85)"
-    )
+    figures = ("pecs", "conjunction", "robust", "inference_acc")
+    print(f"\n{', '.join(figures)}")
     for row in both.to_dict("records"):
-        print(f"  {row['model']:20} {row['regime']:9} {row['pecs']:6.3f} {row['pecs_r']:6.3f} {row['gap']:6.3f}")
+        print(f"  {row['model']:20} {row['regime']:9}", *(f"{row[name]:6.3f}" for name in figures))
 
 
 if __name__ == "__main__":

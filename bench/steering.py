@@ -3,9 +3,9 @@
     python bench/steering.py [--model ID | --random] [--prompts 8] [--directions 8] [--layer L]
 
 Plain: one batch for each direction and dose, which shows the vision tower every clip again. Shipped: rows of all
-directions and doses share batches, the vision tower sees each clip once (`models/local/vision_cache.py`), and what the
-blocks below the steered one make of a prompt is kept (`models/local/prefixes.py`). Answers must be equal, token by
-token. Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU they are seconds.
+directions and doses share batches, and the vision tower sees each clip once (`models/local/vision_cache.py`). Answers
+must be equal, token by token. Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU
+they are seconds.
 
 Then the states of every clip under four prompts, as a study reads those of a control (two questions, two system
 prompts): each pass with its own vision pass, against passes that remember the clip. States must be equal, bit for bit.
@@ -103,7 +103,7 @@ def measure(entry: ModelEntry, chosen: argparse.Namespace) -> None:
         for start in range(0, len(sheet), ROWS):
             rows = sheet[start : start + ROWS]
             along, alphas = vectors[[d for _, d, _ in rows]], tuple(alpha for _, _, alpha in rows)
-            with model.remembering_clips(), model.resuming():
+            with model.remembering_clips():
                 of = [prompts[number] for number, _, _ in rows]
                 answers += model.generate(of, NEW_TOKENS, steering=Steering(along, layer, alphas))
         return answers

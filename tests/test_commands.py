@@ -13,7 +13,8 @@ import pytest
 
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.conftest import ROOT
-from traps_pipeline.cli import build_parser
+from traps_pipeline.cli import GROUPS, build_parser
+from traps_pipeline.cli.command import SHORT
 from traps_pipeline.definitions import defs
 from traps_pipeline.pipeline.graph import the_graph
 
@@ -24,7 +25,6 @@ BLOCK = re.compile(r"^```(?:sh|bash|text|)\n(.*?)^```$", re.DOTALL | re.MULTILIN
 LINE = re.compile(r"(?:[A-Z_]+=\S+ )*(?:[\w/]+/)?(traps|make|dagster|inspect|python3?|pip|uv|apt-get) ")
 SPAN = re.compile(r"`((?:traps|make) [^`|]+)`")
 NOT_RUN = (ROOT / "docs" / "ci.md").read_text().partition("## Commands that no test runs")[2].partition("\n## ")[0]
-NOUNS = ("answers", "confabulation", "judges", "ledger", "models", "requests", "votes")
 MAKEFILE = {
     target
     for name in ("Makefile", "maintainers.mk")
@@ -33,7 +33,8 @@ MAKEFILE = {
 TESTS = {path.relative_to(ROOT / "tests").as_posix(): path.read_text() for path in (ROOT / "tests").rglob("*.py")}
 # A test runs these by other words: the file, and the words.
 RUN_AS = {
-    "traps votes import": ("integration/test_batches.py", 'study.traps(what, "import"'),
+    "traps people review": ("integration/test_review.py", 'listening(study, "review"'),
+    "traps study import-votes": ("integration/test_batches.py", 'f"import-{what}"'),
     "inspect eval": ("release/test_pocket_harness.py", '"-m", "inspect_ai", "eval"'),
     "make docs": ("test_docs_site.py", '"make", "-C", checkout'),
     "make release-check": ("test_habits.py", '"release-check"'),
@@ -65,10 +66,12 @@ def in_spans(text: str) -> Iterator[list[str]]:
 
 
 def name(words: list[str]) -> str:
-    """What is run, without what it is run on: `traps answers import`, `make demo`."""
+    """What is run, without what it is run on: `traps study import-answers`, `make demo`."""
     if words[0].startswith("python"):
         words = words[words.index("-m") + 1 :]
-    deep = 3 if words[0] == "dagster" or words[1] in NOUNS else 1 if words[0] in ("lmms_eval", "venv") else 2
+    if words[0] == "traps" and words[2:] and words[2] in SHORT:
+        words = [words[0], *words[2:]]
+    deep = 3 if words[0] == "dagster" or words[1] in GROUPS else 1 if words[0] in ("lmms_eval", "venv") else 2
     return " ".join(words[:deep])
 
 

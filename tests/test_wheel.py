@@ -141,9 +141,9 @@ def test_a_study_that_wants_more_says_so_before_it_renders(installed: Installed,
         assert not [*(folder / "clips").rglob("*.mp4")]
 
 
-@pytest.mark.parametrize(("command", "extra"), [("ui", "ui"), ("review", "web"), ("annotate", "web")])
+@pytest.mark.parametrize(("command", "extra"), [("ui", "ui"), ("people review", "web"), ("people annotate", "web")])
 def test_a_command_that_wants_more_is_one_sentence(installed: Installed, command: str, extra: str) -> None:
-    finished = installed.traps(command)
+    finished = installed.traps(*command.split())
     assert (finished.code, finished.out) == (1, "")
     assert len(finished.err.splitlines()) == 1
     assert finished.err.endswith(f"not installed: `python -m pip install 'traps-pipeline[{extra}]'`\n")

@@ -23,16 +23,13 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.mechanism.contrast import ccs as ccs
-from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.deciding import Gate, Threshold, fitted_gate
-from traps_pipeline.mechanism.other_probes import NAMED, fit_named
+from traps_pipeline.mechanism.hook import Site, changing
 from traps_pipeline.mechanism.other_probes import erased as erased
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
-from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe
+from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
-from traps_pipeline.mechanism.sites import Site, changing, check_head, head_slice, into_head
 from traps_pipeline.mechanism.stages import saved_directions
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import get_model
@@ -124,28 +121,12 @@ def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 # --- probes -----------------------------------------------------------------------------------------------------------
 
 
-# By name: probes that `protocol` and an experiment's `probes.others` take. CCS takes the states of `contrast`.
-PROBES: dict[str, Fit] = NAMED
-
-
-def contrast(
-    workspace: Where, model: str, *, layer: int, prompt: str = "standard", datasets: Sequence[str] | None = None
-) -> Loaded:
-    """States for contrast-consistent search (`ccs`): X has, for each item, the state behind its question with a
-    statement, and then the state behind the question with its negation, (n, 2 d). Two passes of the model an item."""
-    opened = _workspace(workspace)
-    loaded = load(opened, model, layer=0, prompt=prompt, datasets=datasets)
-    chosen = [*dict.fromkeys(loaded.items["dataset"])]
-    made = contrast_states(opened, Extraction(get_model(model).id, prompt), layer, chosen)
-    return Loaded(np.concatenate([made[name] for name in chosen]), loaded.items)
-
-
 def protocol(
     workspace: Where,
     model: str,
     *,
     layer: int,
-    fit: Fit | str = fit_probe,
+    fit: Fit = fit_probe,
     prompt: str = "standard",
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
     features: Loaded | None = None,
@@ -153,9 +134,9 @@ def protocol(
     """The study's own protocol for another probe: the rows that the table `probe_baselines` has for its baselines, with
     the same items, folds, splits by scenario and intervals.
 
-    fit: states (n, d) and void (n,) to anything with `scores` (`from_sklearn`, your own), or a name of PROBES or of a
-    classifier of scikit-learn. change: a change of the states of a dataset, (n, d) to (n, k). features: what items have
-    in the place of the study's states (`contrast`, or your own); datasets that it lacks are left out. Columns:
+    fit: states (n, d) and void (n,) to anything with `scores` (`from_sklearn`, `mean_difference`, your own). change: a
+    change of the states of a dataset, (n, d) to (n, k). features: what items have in the place of the study's states;
+    datasets that it lacks are left out. Columns:
     analysis, source, target, value (AUROC), low, high, n_voids, n_controls.
     """
     opened = _workspace(workspace)
@@ -175,7 +156,7 @@ def protocol(
         return change(features.X[places])
 
     seed = mechanism.seed if mechanism else 0
-    run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit_named(fit, seed) if isinstance(fit, str) else fit)
+    run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit)
     columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
     return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
 
@@ -216,30 +197,18 @@ def gate(
 
 # --- interventions ----------------------------------------------------------------------------------------------------
 
-Change = Callable[["Tensor", "Tensor", float], "Tensor"]  # states (.., d), unit direction (d,), amount -> states
+Change = Callable[["Tensor", "Tensor", float], "Tensor"]  # states (rows, T, d), unit direction (d,), amount -> states
 
 
-def _add(states: Tensor, unit: Tensor, amount: float) -> Tensor:
+def add(states: Tensor, unit: Tensor, amount: float) -> Tensor:
+    """Add the amount along the direction at every position."""
     return states + amount * unit
-
-
-def _project_out(states: Tensor, unit: Tensor, amount: float) -> Tensor:
-    return states - amount * (states @ unit)[..., None] * unit
-
-
-def _clamp(states: Tensor, unit: Tensor, amount: float) -> Tensor:
-    return states + (amount - states @ unit)[..., None] * unit
-
-
-# By name: add `amount` times the direction; take out that share of the part along it; set that part to `amount`.
-INTERVENTIONS: dict[str, Change] = {"add": _add, "project out": _project_out, "clamp": _clamp}
 
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A direction at a layer of a model. vector: (d,), of any length but 0; (hd,) for one head. layer: 1 to the number
-    of blocks, counted as in hidden_states. gap: the distance between the sides' means along it, for doses in that
-    unit."""
+    """A direction at a layer of a model. vector: (d,), of any length but 0. layer: 1 to the number of blocks, counted
+    as in hidden_states. gap: the distance between the sides' means along it, for doses in that unit."""
 
     vector: np.ndarray
     layer: int
@@ -252,40 +221,20 @@ class Direction:
         amount: float | None = None,
         *,
         gaps: float | None = None,
-        how: str = "add",
+        change: Change = add,
         site: Site = "residual",
-        head: int | None = None,
-        positions: Callable[[Tensor], Tensor] | None = None,
-        when: tuple[Scorer, float] | None = None,
     ) -> Iterator[None]:
         """Change a model's passes inside the context; the hook is gone afterwards, whatever happens.
 
-        model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. how: a key
-        of INTERVENTIONS. positions: of states (rows, T, d), a mask (rows, T) of what is changed; all by default (with a
-        cache, T is 1 after the prompt). when: a probe on states of this very layer and a threshold: a row is changed
-        only if the score of its last token is above it.
-
-        head: with site attention, one head alone, from 0: the slice (rows, T, hd) that it gives to the output
-        projection. A vector of the residual stream is then turned into the head's own direction that writes the most
-        along it, and amounts are lengths of the head's output. Raises TrapsError for a layer, head or width that the
-        model lacks.
+        model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. change:
+        of the states at a site (rows, T, d), with the unit direction and the amount; with a cache, T is 1 after the
+        prompt. Raises TrapsError for a layer or width that the model lacks.
         """
-        block, width, n_heads = _block(model, self.layer)
-        change = INTERVENTIONS.get(how)
+        import torch
+
+        block, width = _block(model, self.layer)
         unit = np.asarray(self.vector, np.float32)
         length = float(np.linalg.norm(unit))
-        if change is None:
-            raise TrapsError(f"no intervention {how!r}; there are {', '.join(INTERVENTIONS)}")
-        check_head(site, head)
-        if head is not None:
-            mine = head_slice(block, head, n_heads)
-            own = mine.stop - mine.start
-            if gaps is not None:
-                raise TrapsError("class gaps are measured in the residual stream, not in a head; give amount")
-            if unit.shape == (width,) and own != width and length:
-                unit = into_head(block, head, n_heads, unit)
-                length = float(np.linalg.norm(unit))
-            width = own
         if unit.shape != (width,) or not np.isfinite(unit).all() or not length:
             raise TrapsError(
                 f"the direction has shape {unit.shape}, but states of this model are {width} finite numbers"
@@ -295,7 +244,8 @@ class Direction:
         if gaps is not None and self.gap is None:
             raise TrapsError("this direction has no class gap; give amount, or take a direction of `inside.direction`")
         dose = float(amount) if amount is not None else float(gaps or 0) * float(self.gap or 0)
-        handle = changing(block, site, head, n_heads, _changer(change, unit / length, dose, positions, when))
+        along = torch.from_numpy(unit / length)
+        handle = changing(block, site, lambda states: change(states, along.to(states.device, states.dtype), dose))
         try:
             yield
         finally:
@@ -306,8 +256,8 @@ class Direction:
         return replace(self, vector=-self.vector)
 
 
-def _block(model: Any, layer: int) -> tuple[Module, int, int]:
-    """A block, the width of the model's states, and the number of its attention heads."""
+def _block(model: Any, layer: int) -> tuple[Module, int]:
+    """A block, and the width of the model's states."""
     network = getattr(model, "network", model)
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks = getattr(decoder, "layers", None)
@@ -315,36 +265,7 @@ def _block(model: Any, layer: int) -> tuple[Module, int, int]:
         raise TrapsError(f"{type(network).__name__} has no get_decoder().layers, so no block can be changed in it")
     if not 1 <= layer <= len(blocks):
         raise TrapsError(f"no block {layer}; {type(network).__name__} has blocks 1 to {len(blocks)}")
-    config = network.config.get_text_config()
-    return blocks[layer - 1], int(config.hidden_size), int(config.num_attention_heads)
-
-
-def _changer(
-    change: Change,
-    unit: np.ndarray,
-    dose: float,
-    positions: Callable[[Tensor], Tensor] | None,
-    when: tuple[Scorer, float] | None,
-) -> Callable[[Tensor], Tensor]:
-    import torch
-
-    chosen_rows: Tensor | None = None
-
-    def changed(states: Tensor) -> Tensor:
-        nonlocal chosen_rows
-        along = torch.from_numpy(unit).to(states.device, states.dtype)
-        made = change(states, along, dose)
-        if positions is not None:
-            made = torch.where(positions(states).to(states.device)[..., None], made, states)
-        if when is not None:
-            # Decided once, at the prompt: a row of a cached pass (one token) keeps the prompt's decision.
-            if states.shape[1] > 1 or chosen_rows is None or len(chosen_rows) != len(states):
-                score = when[0].scores(states[:, -1].float().cpu().numpy())
-                chosen_rows = torch.from_numpy(np.asarray(score) > when[1])
-            made = torch.where(chosen_rows.to(states.device)[:, None, None], made, states)
-        return made
-
-    return changed
+    return blocks[layer - 1], int(network.config.get_text_config().hidden_size)
 
 
 def direction(

@@ -1,4 +1,4 @@
-"""`traps certify` on a benchmark folder: altered records fail it by name and certificate, an untouched one passes."""
+"""`traps benchmark certify` on a folder: altered records fail by name and certificate, an untouched one passes."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     for scenario_id, (alter, _) in ALTERED.items():
         copy_record(scenario_id, folder, alter)
     copy_record(UNTOUCHED, folder)
-    return Checkout(ROOT, folder / "workspace").traps("certify", "--specs", folder)
+    return Checkout(ROOT, folder / "workspace").traps("benchmark", "certify", "--specs", folder)
 
 
 @pytest.mark.parametrize("scenario_id", ALTERED)

@@ -37,6 +37,7 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
             "pecs_low": pecs,
             "pecs_high": pecs,
             "naive": acc * abs_rec,
+            "pecs_by_family": pecs,
             "epoch": "e1",
             "benchmark_version": "v1",
         },

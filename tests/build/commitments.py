@@ -18,7 +18,7 @@ def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def make(folder: Path) -> str:
         sample_benchmark(folder / "private", {"hidden_drop": 1}, 2026, "private", workers=1)
         files = ("--out", folder / "commitment.json", "--reveal", folder / "reveal.json")
-        assert main(["commit", *map(str, (folder / "private", *files))]) == 0
+        assert main(["benchmark", "commit", *map(str, (folder / "private", *files))]) == 0
         return ""
 
     return once(tmp_path_factory, "committed", make)

@@ -11,7 +11,7 @@ from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
-from traps_pipeline.protocol.datasets import ANSWERABLE_ARMS, ARMS, VOID_ARMS
+from traps_pipeline.protocol.datasets import ARMS, sides_of
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -26,8 +26,7 @@ JUDGES = ("rule-1", "rule-2", "rule-3")
 def of_arm(rows: Rows, arm: str, pairs: list[tuple[bool, bool, bool]], **cell: object) -> pd.DataFrame:
     """VERDICTS rows of an arm: of the sides that it has."""
     both = rows(pairs, dataset=arm, **cell)
-    sides = ["control"] * (arm not in VOID_ARMS) + ["void"] * (arm not in ANSWERABLE_ARMS)
-    return both.loc[both["side"].isin(sides)].reset_index(drop=True)
+    return both.loc[both["side"].isin(sides_of(arm))].reset_index(drop=True)
 
 
 def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:

@@ -12,7 +12,7 @@ import pytest
 from traps_pipeline.cli import build_parser, main
 from traps_pipeline.cli.run import _print_problems
 
-SAMPLE = ["sample", "--seed", "1", "--out", "x"]
+SAMPLE = ["benchmark", "sample", "--seed", "1", "--out", "x"]
 
 
 @pytest.mark.parametrize(
@@ -21,8 +21,8 @@ SAMPLE = ["sample", "--seed", "1", "--out", "x"]
         *([*SAMPLE, "--scale", said] for said in ("nan", "inf", "-1", "0", "1e3", "1_0", "\u0661", "9" * 400)),
         *([*SAMPLE, "--count", said] for said in ("0", "-1", "1.0", "1_0", "9" * 30, "\u0661")),
         *(["ui", "--port", said] for said in ("0", "65536", "3000.0", "-1", " 80")),
-        ["sample", "--out", "x", "--seed", "-1"],
-        ["certify", "--workers", "0"],
+        ["benchmark", "sample", "--out", "x", "--seed", "-1"],
+        ["benchmark", "certify", "--workers", "0"],
     ],
 )
 def test_a_number_that_is_none_is_bad_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,7 +53,7 @@ def test_words_of_any_kind_in_the_place_of_an_experiment_end_in_a_sentence(
 
 
 def test_a_pipe_that_is_closed_ends_a_command_in_silence() -> None:
-    command = f"{sys.executable} -m traps_pipeline.cli audit | head -1"
+    command = f"{sys.executable} -m traps_pipeline.cli results audit | head -1"
     ran = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
     assert ran.stderr == ""
 

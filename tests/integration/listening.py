@@ -1,4 +1,4 @@
-"""Servers of `traps review` and `traps annotate` as a test starts, asks and kills them, and a browser that watches."""
+"""Servers of `traps people review` and `annotate` as a test starts, asks and kills them, and a browser that watches."""
 
 from __future__ import annotations
 
@@ -57,12 +57,13 @@ class Server:
 
 @contextmanager
 def listening(study: Checkout, command: str, *people: str, port: int = 0) -> Iterator[Server]:
-    """`traps review` or `traps annotate` for these people; killed at the end unless it was before."""
+    """`traps people review` or `traps people annotate` for these people; killed at the end unless it was before."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(("127.0.0.1", port))
         port = probe.getsockname()[1]
-    called = [sys.executable, "-m", "traps_pipeline.cli", command, "--port", str(port), "--token", TOKEN, "--who"]
+    called = [sys.executable, "-m", "traps_pipeline.cli", "people", command]
+    called += ["--port", str(port), "--token", TOKEN, "--who"]
     process = study.start(*called, *people)
     server = Server(port, process, {})
     try:

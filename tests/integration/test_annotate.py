@@ -1,4 +1,4 @@
-"""`traps annotate` with scripted annotators in a real browser: what is sent, what is kept, and the tables of it."""
+"""`traps people annotate` with scripted annotators in a real browser: what is sent and kept, and the tables of it."""
 
 from __future__ import annotations
 
@@ -276,6 +276,6 @@ def test_strangers_and_others_get_nothing(study: Checkout) -> None:
             "this was labelled before, in another window perhaps; load the page again",
         )
         assert server.ask("POST", "/reopen", {"task": "correctness"}, who="jd")[0] == 404
-    assert study.traps("annotate", "--who", "jd", "jd").code == 1
-    beyond = study.traps("annotate", "--who", "jd", "--host", "0.0.0.0")
+    assert study.traps("people", "annotate", "--who", "jd", "jd").code == 1
+    beyond = study.traps("people", "annotate", "--who", "jd", "--host", "0.0.0.0")
     assert beyond.code == 1 and "TRAPS_ANNOTATE_TOKEN" in beyond.err

@@ -1,5 +1,5 @@
-"""Arms from an experiment to PECS-R, and variations to the table of hypotheses: asked on request, made once, and no
-part of the pairs' figures."""
+"""Arms from an experiment to the conjunction, and variations to the table of hypotheses: asked on request, made once,
+and no part of the pairs' figures."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Checkout
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
 from traps_pipeline.scoring.score_rows import HYPOTHESES, LEADERBOARD, ROBUST
@@ -24,7 +25,7 @@ panel: rules
 epoch: small
 scenarios: [hidden_race-0001, plinko-0001]
 datasets:
-  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, decoy, held_void, twin_control, choices_swapped,
+  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, decoy, twin_control, crossed,
    labels_two, labels_six, panel_grey, schema_abstain, frames_few]
 """
 
@@ -38,24 +39,29 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     until = ("--until", "leaderboard,robust,hypotheses")
     run = other.traps("run", path, *until)
     assert run.code == 0, run.err
-    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, held_void 1, twin_control 2, choices_swapped 2 x 2.
+    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 2 x 2.
     # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each.
-    assert run.counts()["answers"] == 3 * (8 + (1 + 1 + 2 + 4) + (4 + 1 + 4 + 4))
-    assert run.counts()["frames"] == 50 + 50 + 50  # decoy, held and grey; the others show the pair's own clips
+    assert run.counts()["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4))
+    assert run.counts()["frames"] == 50 + 50  # decoy and grey; the others show the pair's own clips
     tables = Workspace.open(other.workspace).tables
     arms = tables.read_all(ARMS)
     (refused,) = arms.dropna(subset=["refused"])["scenario_id"].unique()
     assert refused == "plinko-0001"  # the numbers of its buckets are no colours
-    items = tables.read_all(ITEMS, dataset="held_void")
-    assert list(items["side"]) == ["void"] and items["ground_truth"].isna().all()
+    items = tables.read_all(ITEMS, dataset="crossed").set_index("item_id")
+    pair = tables.read_all(ITEMS, dataset="chaotic").set_index("item_id")
+    aside, foreign = (items.loc[f"crossed:plinko-0001:{side}"] for side in ("control", "void"))
+    answer = load_released()["plinko-0001"].answerable_question.answer
+    assert (aside["clip"], aside["ground_truth"]) == (pair.loc["chaotic:plinko-0001:void", "clip"], answer)
+    assert foreign["clip"] == pair.loc["chaotic:plinko-0001:control", "clip"]
+    assert items["ground_truth"].isna().groupby(items["side"]).all().to_dict() == {"control": False, "void": True}
     robust = tables.read_all(ROBUST).set_index("model")
     board = tables.read_all(LEADERBOARD).query("dataset == 'overall'").set_index("model")
-    assert robust.loc["oracle", "pecs_r"] == board.loc["oracle", "pecs"] == 1.0
+    figures = ["conjunction", "robust"]
+    assert robust.loc["oracle", figures].tolist() == [1.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
-    assert robust.loc["any-rule", "pecs_r"] < 0.25
-    assert robust.loc["any-rule", "gap"] == pytest.approx(1.0 - robust.loc["any-rule", "pecs_r"])
+    assert robust.loc["any-rule", "conjunction"] == 0 and robust.loc["any-rule", "robust"] < 0.8
     board_text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
-    assert "(4 of 9 arms)" in board_text and "nan" not in board_text and "no gap" not in board_text
+    assert "all over 3 of 7 arms" in board_text and "nan" not in board_text and "no conjunction" not in board_text
     doses = tables.read_all(HYPOTHESES).set_index(["model", "hypothesis", "dose"])
     grey = doses.loc[("panel-rule", "panel", "grey")]
     assert (grey["at_reference"], grey["value"], grey["rule_change"]) == (1.0, 0.0, -1.0)

@@ -73,7 +73,7 @@ def _post(address: str, body: Any) -> Any:
 
 def through_files(study: Checkout, path: Path, what: str, url: str, folder: Path) -> None:
     """Export requests or votes, have each file answered as its provider would, and import what comes back."""
-    export = ("requests", "export", path, "--batch") if what == "answers" else ("votes", "export", path)
+    export = ("study", "export-requests", path, "--batch") if what == "answers" else ("study", "export-votes", path)
     exported = study.traps(*export, "--out", folder)
     assert exported.code == 0, exported.err
     files = sorted((folder / "batches").iterdir())
@@ -83,7 +83,7 @@ def through_files(study: Checkout, path: Path, what: str, url: str, folder: Path
         text = file.read_text()
         asked = json.loads(text)["requests"] if file.suffix == ".json" else map(json.loads, text.splitlines())
         results.write_text("".join(json.dumps(answered(url, line)) + "\n" for line in asked))
-        imported = study.traps(what, "import", path, results)
+        imported = study.traps("study", f"import-{what}", path, results)
         assert imported.code == 0 and "0 were there already" in imported.out, imported.err
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -145,8 +144,7 @@ def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Che
     materialize(study, "items", "occlusion")
     materialize(study, "responses", "occlusion|oracle__standard__run1")
     assert stale_in_dagster(study) == []
-    rows = re.findall(r"^[a-z_ ]+ +\d+ +(\d+) +(\d+)$", study.traps("status", EXPERIMENT).out, re.MULTILINE)
-    assert len(rows) > 20 and set(rows) == {("0", "0")}  # stale and missing
+    assert study.traps("status", EXPERIMENT).out.endswith(" stages are fresh\n")
 
 
 @pytest.mark.promise

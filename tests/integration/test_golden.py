@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -47,9 +48,12 @@ def test_a_second_run_does_nothing_and_status_and_plan_agree(study: Checkout) ->
     assert again.code == 0, again.err
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "tables and figures" not in again.err  # no partition was materialized
-    status = study.traps("status", EXPERIMENT).out
+    place, fresh = study.traps("status", EXPERIMENT).out.splitlines()
+    assert place == f"workspace {study.workspace}"
+    assert re.fullmatch(r"all \d+ partitions of \d+ stages are fresh", fresh)
+    stages = {row["stage"]: row for row in json.loads(study.traps("status", EXPERIMENT, "--json").out)["stages"]}
     expected = {"scene_specs": 4, "items": 4, "responses": 24, "verdicts": 24, "leaderboard": 1}
     for stage, partitions in expected.items():
-        assert re.search(rf"^{stage} +{partitions} +0 +0$", status, re.MULTILINE), status
+        assert stages[stage] == {"stage": stage, "fresh": partitions, "stale": {}, "missing": []}
     plan = study.traps("plan", EXPERIMENT).out
     assert re.search(rf"^all +{ANSWERS} +{ANSWERS} +0 +{VOTES:,} +{VOTES:,} +0$", plan, re.MULTILINE), plan

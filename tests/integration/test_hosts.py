@@ -77,7 +77,7 @@ def test_hosts_ask_each_call_once_and_one_goes_on_where_another_is_killed(
     assert provider.stats()["answered_in_full"] == sent
     assert compare(one.workspace, two.workspace) == 0
     assert one.ledger_rows("answers") == []  # nothing of it lies in a folder
-    moved = one.traps("ledger", "export", str(one.workspace / "ledger" / "ledger.sqlite"))
+    moved = one.traps("study", "export-ledger", str(one.workspace / "ledger" / "ledger.sqlite"))
     assert moved.code == 0, moved.err
     rows = settled(one)
     assert len(rows) == len({row["key"] for row in rows}) == WANTED

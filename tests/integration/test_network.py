@@ -121,12 +121,12 @@ def test_money_of_calls_that_a_kill_cut_off_is_released_and_the_study_goes_on(
     blocked = ask(unasked, path)
     assert (blocked.code, "the budget of the study is reached" in blocked.err) == (4, True), blocked.err
     assert settled(unasked) == []
-    listed = unasked.traps("ledger", "release")
+    listed = unasked.traps("study", "release-money")
     assert listed.code == 0 and "image-model" in listed.out
-    release = ("ledger", "release", "--participant", "image-model", "--all-in-flight")
+    release = ("study", "release-money", "--participant", "image-model", "--all-in-flight")
     assert unasked.traps(*release).code == 1  # a reason is wanted
     assert unasked.traps(*release, "--why", "the provider's bill has none of them").code == 0
-    assert "nothing may be released" in unasked.traps("ledger", "release").out
+    assert "nothing may be released" in unasked.traps("study", "release-money").out
     assert ask(unasked, path).code == 4  # goes on, up to the same cap
     assert 0 < sum(row["cost_usd"] for row in settled(unasked)) <= 0.4
 
@@ -240,7 +240,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
     path = experiment(unasked, ["video-model", "image-model"], regimes=["standard"], datasets=["occlusion"])
-    exported = unasked.traps("requests", "export", path, "--out", tmp_path / "batch")
+    exported = unasked.traps("study", "export-requests", path, "--out", tmp_path / "batch")
     assert exported.code == 0, exported.err
     lines = [json.loads(line) for line in (tmp_path / "batch" / "requests.jsonl").read_text().splitlines()]
     assert len(lines) == len({line["key"] for line in lines}) == 24
@@ -253,7 +253,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     given = tmp_path / "answers.jsonl"
 
     given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:20], {"key": "0" * 64, "text": "x"}]))
-    refused = unasked.traps("answers", "import", path, given)
+    refused = unasked.traps("study", "import-answers", path, given)
     assert refused.code == 1
     assert "answers.jsonl:21: key 0000000000000000 is not wanted" in refused.err
     assert "nothing was imported" in refused.err
@@ -261,20 +261,20 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
 
     failed = answers[5] | {"text": "Error: 429 Too Many Requests"}
     given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:5], failed, *answers[6:20]]))
-    stopped = unasked.traps("answers", "import", path, given)
+    stopped = unasked.traps("study", "import-answers", path, given)
     assert stopped.code == 1 and "1 of its texts look like error messages" in stopped.err
     assert "'Error: 429 Too Many Requests'" in stopped.err and settled(unasked) == []
-    dropped = unasked.traps("answers", "import", path, given, "--errors", "drop").out
+    dropped = unasked.traps("study", "import-answers", path, given, "--errors", "drop").out
     assert "19 answers imported" in dropped and "1 error messages were left out" in dropped
     for content, complaint in ((b"", "holds no answers"), (b"\x89PNG\xff\xfe\x00", "cannot be read as lines of text")):
         given.write_bytes(content)
-        stopped = unasked.traps("answers", "import", path, given)
+        stopped = unasked.traps("study", "import-answers", path, given)
         assert stopped.code == 1 and complaint in stopped.err
 
     given.write_text("\n".join(json.dumps(answer) for answer in answers[:20]))
-    assert "1 answers imported, 19 were there already" in unasked.traps("answers", "import", path, given).out
+    assert "1 answers imported, 19 were there already" in unasked.traps("study", "import-answers", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
-    assert "4 answers imported, 20 were there already" in unasked.traps("answers", "import", path, given).out
+    assert "4 answers imported, 20 were there already" in unasked.traps("study", "import-answers", path, given).out
     finished = ask(unasked, path)
     assert finished.code == 0, finished.err
     assert finished.counts()["answers"] == 0

@@ -3,6 +3,7 @@ machine makes in a folder."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -77,7 +78,8 @@ def test_hosts_make_one_study_together_and_it_is_that_of_a_single_machine(
     rest = two.traps("run", EXPERIMENT, "--until", "leaderboard")
     assert rest.code == 0, rest.out + rest.err
     assert rest.counts() == {"answers": ANSWERS, "votes": rest.counts()["votes"], "frames": 0}
-    assert "leaderboard 1 0 0" in " ".join(three.traps("status").out.split())
+    stages = {row["stage"]: row["fresh"] for row in json.loads(three.traps("status", "--json").out)["stages"]}
+    assert stages["leaderboard"] == 1
 
     workspace, store = opened(two, monkeypatch)
     store.bring(store.below(workspace.tables.root))
@@ -118,7 +120,7 @@ def test_errors_name_the_host_the_study_and_the_remedy(
     assert refused.code == 1 and "See that the bucket exists" in refused.err
     made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
     assert made.code == 0, made.err
-    for command in (("ledger", "move", "--store", "s3://lab/other"), ("annotate", "--who", "jd")):
+    for command in (("study", "move", "--store", "s3://lab/other"), ("people", "annotate", "--who", "jd")):
         refused = one.traps(*command, "--workspace", "s3://lab/refusals")
         assert refused.code == 1 and "s3://lab/refusals: " in refused.err, refused.err
     refused = one.traps("status", "--workspace", "ftp://lab/study")

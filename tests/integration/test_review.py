@@ -1,4 +1,4 @@
-"""`traps review` in a real browser: ten scenarios by keyboard, a kill in between, then a run asks what they touch."""
+"""`traps people review` in a real browser: ten scenarios by keyboard, a kill, then a run asks what they touch."""
 
 from __future__ import annotations
 

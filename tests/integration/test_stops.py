@@ -100,7 +100,7 @@ def test_pages_for_people_end(
     background: Background, small: Checkout, pages: tuple[str, ...], stop: signal.Signals
 ) -> None:
     background.environment["TRAPS_WORKSPACE"] = str(small.workspace)
-    pid = background.traps(*pages, "--who", "jd", "--port", str(background.port))
+    pid = background.traps("people", *pages, "--who", "jd", "--port", str(background.port))
     background.wait_until(lambda: _listens(background.port))
     os.kill(pid, stop)
     wait_until_gone(background.mark, END_S)

@@ -131,9 +131,9 @@ def test_a_wrong_file_of_attacks_is_named(tmp_path: Path, change: tuple[str, str
 
 def test_the_command_prints_what_moved_by_judge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Workspace.create(tmp_path, Study())
-    assert main(["judges", "check", "rules", "--workspace", str(tmp_path)]) == 0
+    assert main(["models", "test-panel", "rules", "--workspace", str(tmp_path)]) == 0
     out = capsys.readouterr().out.splitlines()
     (line,) = (row for row in out if row.startswith("rule-2 "))
     assert line.split() == ["rule-2", "42", "24", "0", "18", "0"]
-    assert main(["judges", "check", "nobody", "--workspace", str(tmp_path)]) == 1
+    assert main(["models", "test-panel", "nobody", "--workspace", str(tmp_path)]) == 1
     assert "no panel 'nobody'; it has rules, paper" in capsys.readouterr().err

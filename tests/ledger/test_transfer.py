@@ -84,12 +84,12 @@ def test_the_commands_write_a_file_once_and_read_what_they_wrote(
     one, two = (Workspace.create(tmp_path / name, Study()) for name in ("one", "two"))
     write(one.answers, answer("a", "left"))
     file = tmp_path / "answers.sqlite"
-    assert main(["ledger", "export", "--workspace", str(one.root), str(file)]) == 0
+    assert main(["study", "export-ledger", "--workspace", str(one.root), str(file)]) == 0
     assert "1 rows are in" in capsys.readouterr().out
-    assert main(["ledger", "export", "--workspace", str(one.root), str(file)]) == 1
+    assert main(["study", "export-ledger", "--workspace", str(one.root), str(file)]) == 1
     assert "is there already" in capsys.readouterr().err
-    assert main(["ledger", "import", "--workspace", str(two.root), str(file)]) == 0
+    assert main(["study", "import-ledger", "--workspace", str(two.root), str(file)]) == 0
     assert [*two.answers.read("m").rows] == ["a"]
     file.write_bytes(b"no ledger")
-    assert main(["ledger", "import", "--workspace", str(two.root), str(file)]) == 1
+    assert main(["study", "import-ledger", "--workspace", str(two.root), str(file)]) == 1
     assert str(file) in capsys.readouterr().err

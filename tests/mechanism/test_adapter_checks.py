@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import patching_effects
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local import capture, prefixes
+from traps_pipeline.models.local import capture
 from traps_pipeline.models.local import vision_cache as clips
 from traps_pipeline.models.local.model import LocalModel
 
@@ -61,16 +60,6 @@ def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(patching_effects, "_behind", lambda _, __: None)
 
 
-def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:
-    record = prefixes._record
-
-    def other(*of: Any) -> prefixes.Prefix | None:
-        made = record(*of)
-        return made and replace(made, states=-made.states)
-
-    patch.setattr(prefixes, "_record", other)
-
-
 @pytest.mark.parametrize(
     ("family", "check", "broken", "said"),
     [
@@ -78,8 +67,6 @@ def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:
         ("qwen3-vl", "alpha 0", a_hook_that_stays, "steering with alpha 0 leaves a hook"),
         ("qwen3-vl", "alpha", a_hook_that_stays, "a steered state at layer 2 is not the plain one and alpha times v"),
         ("qwen3-vl", "clips", rounded_features, "a remembered clip gives other states"),
-        ("qwen3-vl", "resuming", prefixes_of_other_states, "a resumed answer is another one"),
-        ("gemma-4", "resuming", prefixes_of_other_states, "a resumed answer is another one"),
         (
             "gemma-4",
             "patching",
@@ -96,12 +83,12 @@ def test_a_check_loses_where_the_adapter_is_broken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     subject = Subject(model(family), *brightening())
-    subject.model.clips, subject.model.prefixes = clips.ClipMemory(), prefixes.PrefixMemory()
+    subject.model.clips = clips.ClipMemory()
     with monkeypatch.context() as patch:
         broken(patch)
         with pytest.raises(TrapsError, match=said):
             BY_NAME[check].found(subject)
-    subject.model.clips, subject.model.prefixes = clips.ClipMemory(), prefixes.PrefixMemory()
+    subject.model.clips = clips.ClipMemory()
     BY_NAME[check].found(subject)
 
 

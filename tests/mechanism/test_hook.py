@@ -38,21 +38,6 @@ def test_a_steered_state_is_the_unsteered_one_plus_alpha_v_exactly(family: Famil
 
 
 @each_family
-def test_the_part_along_a_direction_is_taken_out_or_set(family: Family) -> None:
-    of, prompt = model(family), three_prompts(family)[0]
-    v = direction(of)
-    plain = of.forward_states(prompt).raw[2]
-    rest = plain - (plain @ v) * v
-    for removed, alpha in ((1.0, 0.0), (0.25, 0.0), (1.0, -4.5)):
-        hook = Steering(7 * v, 2, (alpha / 7,), (removed,))  # taken out along the direction, whatever its length
-        found = of.forward_states(prompt, steering=hook).raw[2]
-        assert found @ v == pytest.approx((1 - removed) * (plain @ v) + alpha, abs=1e-4)
-        assert found - (found @ v) * v == pytest.approx(rest, abs=1e-4)
-    rows = Steering(v, 2, (0.0, 3.0), (1.0, 0.0)).rows([1])
-    assert (rows.alphas, rows.removed) == ((3.0,), (0.0,))
-
-
-@each_family
 def test_every_position_of_the_prompt_is_steered_alike(family: Family) -> None:
     of, prompt = model(family), three_prompts(family)[0]
     v = direction(of)

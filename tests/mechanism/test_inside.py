@@ -11,15 +11,16 @@ import pandas as pd
 import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from tests.conftest import ROOT
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_verdicts
+from tools.inside_notebook import cells, execute
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.baselines import RAW, baseline_rows, output_margins
-from traps_pipeline.mechanism.contrast import _loss
+from traps_pipeline.mechanism.baselines import RAW, output_margins
 from traps_pipeline.mechanism.deciding import ABSTENTION
 from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
@@ -28,7 +29,7 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.other_probes import Eraser
 from traps_pipeline.mechanism.probe_items import probe_items
-from traps_pipeline.mechanism.probes import auroc, scenario_folds
+from traps_pipeline.mechanism.probes import scenario_folds
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
@@ -67,8 +68,7 @@ def test_the_page_runs_as_it_is_written(study: Workspace) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     code = "\n".join(blocks).replace('".workspaces/mechanism"', repr(str(study.root))).replace('"pocket"', '"tiny"')
     assert len(blocks) >= 6
-    names: dict[str, object] = {}
-    exec(compile(code, "docs/inside.md", "exec"), names)
+    names = execute(cells(f"```python\n{code}```\n"))
     assert not torch.equal(names["pushed"], names["plain"])  # type: ignore[arg-type]
 
 
@@ -131,21 +131,21 @@ def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry:
     plain.remove()
     assert ours.tokens == theirs.tokens and [*ours.tokens] == own[: len(ours.tokens)]
     before = model.forward_states(prompt).raw
-    with push.apply(model, 0.0, how="clamp"):
-        clamped = model.forward_states(prompt).raw
-    assert abs(clamped[2] @ push.vector) < 1e-4 < abs(before[2] @ push.vector)
-    with push.apply(model, 1.0, how="project out"):
-        assert model.forward_states(prompt).raw[2] == pytest.approx(clamped[2], abs=1e-5)
-    score = type("Score", (), {"scores": staticmethod(lambda states: np.zeros(len(states)))})()
-    for threshold, changed in ((1.0, False), (-1.0, True)):
-        with push.apply(model, 5.0, when=(score, threshold)):
-            assert (model.forward_states(prompt).raw[2] != before[2]).any() == changed
-    with push.apply(model, 5.0, positions=lambda states: torch.zeros(states.shape[:2], dtype=torch.bool)):
-        assert (model.forward_states(prompt).raw == before).all()
+    along = torch.from_numpy(push.vector)
+    with push.apply(
+        model, 1.0, change=lambda states, unit, amount: states - amount * (states @ unit)[..., None] * unit
+    ):
+        without = model.forward_states(prompt).raw
+    assert abs(without[2] @ push.vector) < 1e-4 < abs(before[2] @ push.vector)
+    attention = model.network.get_decoder().layers[1].self_attn
+    plain = attention.register_forward_hook(lambda module, args, output: (output[0] + 5.0 * along, *output[1:]))
+    expected = model.forward_states(prompt).raw
+    plain.remove()
+    with push.apply(model, 5.0, site="attention"):
+        assert (model.forward_states(prompt).raw == expected).all() and (expected[2] != before[2]).any()
     assert (model.forward_states(prompt).raw == before).all()  # every hook is gone
-    for wrong, message in (({"how": "mine"}, "no intervention"), ({"gaps": 1.0}, "and not both")):
-        with pytest.raises(TrapsError, match=message), push.apply(model, 1.0, **wrong):
-            pass
+    with pytest.raises(TrapsError, match="and not both"), push.apply(model, 1.0, gaps=1.0):
+        pass
     with pytest.raises(TrapsError, match="no block 9"), inside.Direction(push.vector, 9).apply(model, 1.0):
         pass
 
@@ -200,20 +200,11 @@ def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, ent
     assert decided == {True, False}
 
 
-def test_every_named_probe_is_one_for_the_study_and_for_a_notebook(study: Workspace, entry: ModelEntry) -> None:
-    probes = study.mechanism.probes.model_copy(update={"others": ("CCS", "erased", "mean difference")})
-    own = study.allow(mechanism=study.mechanism.model_copy(update={"probes": probes}))
-    rows = pd.DataFrame([vars(row) for row in baseline_rows(own, entry, StoredStates.of(own, STANDARD))])
-    pairs = inside.contrast(own, "tiny", layer=2)
-    for name, features in (("CCS", pairs), ("erased", None), ("mean difference", None)):
-        theirs = inside.protocol(own, "tiny", layer=2, fit=name, features=features)
-        ours = rows.query(f"features == 'states, {name}'")
-        assert list(ours["value"]) == list(theirs["value"]) and len(ours) > 4
-    states = inside.load(own, "tiny", layer=2, datasets=["chaotic"])
-    assert (inside.PROBES["erased"](states.X, states.void).scores(states.X) == 0).all()
+def test_an_erased_state_is_changed_alike_whatever_stands_beside_it(study: Workspace) -> None:
+    states = inside.load(study, "tiny", layer=2, datasets=["chaotic"])
     eraser = Eraser.of(states.X, states.void)
     assert eraser(states.X) == pytest.approx(inside.erased(states.X, states.void))
-    assert eraser(states.X[:3]) == pytest.approx(eraser(states.X)[:3])  # a state is changed whatever stands beside it
+    assert eraser(states.X[:3]) == pytest.approx(eraser(states.X)[:3])
 
 
 def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_else() -> None:
@@ -227,45 +218,16 @@ def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_e
     assert np.abs(LogisticRegression().fit(gone, void).coef_).max() < 1e-4
 
 
-def test_contrast_consistent_search_finds_what_a_statement_and_its_negation_disagree_on() -> None:
-    """Pairs whose halves differ by plus or minus one direction, and share everything else: no label is needed but for
-    the sign. The words of the statement shift all of its states alike, which says nothing."""
-    rng = np.random.default_rng(0)
-    void, truth = np.arange(80) % 2 == 1, np.eye(6)[2]
-    shared = rng.normal(size=(80, 6))
-    sign = np.where(void, -1.0, 1.0)[:, None]
-    pairs = np.hstack([shared + sign * truth + 9.0, shared - sign * truth - 9.0])
-    probe = inside.ccs(pairs, void)
-    assert auroc(void, probe.scores(pairs)) == 1.0
-    assert auroc(void, inside.ccs(pairs, ~void).scores(pairs)) == 0.0  # one bit of labels, and no more
-    other = inside.ccs(pairs, rng.permutation(void)).scores(pairs)
-    assert np.abs(other) == pytest.approx(np.abs(probe.scores(pairs)))
-    with pytest.raises(TrapsError, match="are not pairs"):
-        inside.ccs(pairs[:, :11], void)
-
-
-def test_the_gradient_of_the_search_is_that_of_its_loss() -> None:
-    rng = np.random.default_rng(1)
-    yes, no, values = rng.normal(size=(9, 4)), rng.normal(size=(9, 4)), rng.normal(size=5)
-    numeric = [
-        (_loss(values + step, yes, no)[0] - _loss(values - step, yes, no)[0]) / 2e-6 for step in 1e-6 * np.eye(5)
-    ]
-    assert _loss(values, yes, no)[1] == pytest.approx(numeric, abs=1e-7)
-
-
-def test_probes_of_pairs_take_the_protocol_of_the_study(study: Workspace, entry: ModelEntry) -> None:
-    pairs = inside.contrast(study, "tiny", layer=2, datasets=["chaotic", "chaotic_ill_posed"])
-    assert pairs.X.shape == (4 * PAIRS, 2 * load_local_model(entry).d_model)
-    yes, no = np.split(pairs.X, 2, axis=1)
-    assert (yes != no).any(axis=1).all()
-    figures = inside.protocol(study, "tiny", layer=2, fit="CCS", features=pairs)
-    assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
-    assert figures["value"].between(0, 1).all()
+def test_the_protocol_takes_any_probe_and_any_features_of_items(study: Workspace) -> None:
     states = inside.load(study, "tiny", layer=2)
-    own = inside.protocol(study, "tiny", layer=2, fit="logistic")
+    own = inside.protocol(study, "tiny", layer=2)
     assert inside.protocol(study, "tiny", layer=2, features=states).equals(own)
-    with pytest.raises(TrapsError, match="no probe 'mine'; name one of logistic, mean difference, CCS"):
-        inside.protocol(study, "tiny", layer=2, fit="mine")
+    plain = inside.from_sklearn(lambda: make_pipeline(StandardScaler(), LogisticRegression(tol=1e-10, max_iter=10_000)))
+    theirs = inside.protocol(study, "tiny", layer=2, fit=plain)
+    assert theirs["value"].to_numpy(float) == pytest.approx(own["value"].to_numpy(float), nan_ok=True)
+    assert not inside.protocol(study, "tiny", layer=2, fit=inside.mean_difference).equals(own)
+    some = states.where("dataset in ['chaotic', 'chaotic_ill_posed']")
+    figures = inside.protocol(study, "tiny", layer=2, features=some)
+    assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
     with pytest.raises(TrapsError, match="lacks 2 items of chaotic"):
-        few = inside.Loaded(pairs.X[2:], pairs.items.iloc[2:])
-        inside.protocol(study, "tiny", layer=2, features=few)
+        inside.protocol(study, "tiny", layer=2, features=inside.Loaded(some.X[2:], some.items.iloc[2:]))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.build.errors import raises
 from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import output_margins
@@ -27,6 +30,7 @@ from traps_pipeline.mechanism.margin import begins_abstention
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probing import ProbeRun
+from traps_pipeline.mechanism.sentences import sentence_rows
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.mechanism.untrained import untrained_states
@@ -34,7 +38,8 @@ from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import sample
@@ -275,3 +280,36 @@ def test_the_lens_is_the_models_norm_and_head_on_each_layer_and_ends_at_the_outp
     told = chance[:, begins].sum(1)
     odds = torch.log(told / (1 - told)).numpy()
     assert rows.loc[("chaotic", 2), "voids"] == pytest.approx(odds[void].mean(), abs=1e-3)
+
+
+def test_sentences_are_as_likely_as_the_librarys_own_logits_say(study: Workspace, entry: ModelEntry) -> None:
+    item = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).iloc[0]
+    partition = Cell("chaotic", Evaluation("tiny", "standard", 1)).partition
+    texts = {item["item_id"]: "It ends left.", "chaotic:plinko-1:void": None}
+    answers = [
+        filled(RESPONSES, item_id=name, text=text, created_at=datetime.now(UTC), **partition)
+        for name, text in texts.items()
+    ]
+    study.tables.write(RESPONSES, partition, answers, {})
+    rows = {row.item_id: row for row in sentence_rows(study, entry, STANDARD)}
+    row, model = rows[item["item_id"]], load_local_model(entry, inside=True)
+    assert entry.media is not None
+    shown = sample(study.resolve(item["clip"]), entry.media)
+    prompt = model.prompt(system_prompt("standard"), item["question"], shown.frames, shown.times_s)
+    likely: dict[str, float] = {}
+    for text in (*study.mechanism.sentences, "It ends left."):
+        tokens = torch.tensor([model.processor.tokenizer(text, add_special_tokens=False).input_ids])
+        inputs = dict(prompt.inputs) | {"input_ids": torch.cat([prompt.inputs["input_ids"], tokens], 1)}
+        for name in {*prompt.sequences} - {"input_ids"}:
+            more = torch.full_like(tokens, 1 if name == "attention_mask" else 0, dtype=inputs[name].dtype)
+            inputs[name] = torch.cat([inputs[name], more], 1)
+        with torch.no_grad():
+            logits = model.network(**inputs).logits[0, -tokens.shape[1] - 1 : -1].log_softmax(-1)
+        likely[text] = float(logits.gather(1, tokens.T).mean())
+    assert row.own == pytest.approx(likely.pop("It ends left."), abs=1e-5) and row.own_tokens == 13
+    assert row.abstention == pytest.approx(likely[row.sentence], abs=1e-5) and likely[row.sentence] == max(
+        likely.values()
+    )
+    assert rows["chaotic:plinko-1:void"].own is None and len(rows) == 2 * PAIRS
+    with raises(TrapsError, "mechanism.sentences.sentence_rows", "guided"):
+        sentence_rows(study, entry, Extraction("tiny", "guided"))

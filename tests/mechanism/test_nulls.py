@@ -7,7 +7,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from traps_pipeline.mechanism.degeneracy import degeneracy, language
+from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
 
 
@@ -62,28 +62,3 @@ def test_pecs_of_a_steered_model_depends_on_the_sign_policy() -> None:
 )
 def test_a_text_that_is_no_answer_is_told(text: str | None, outcome: str, why: str | None) -> None:
     assert degeneracy(text, outcome, "The ball ends up right.") == why
-
-
-@pytest.mark.parametrize(
-    ("spoken", "text"),
-    [
-        ("English", "The ball is hidden by the panel, so it cannot be determined from the video which bin it ends in."),
-        ("German", "Das kann nicht gesagt werden, denn der Ball ist hinter der Tafel und die Szene wird verdeckt."),
-        ("French", "Il n'est pas possible de le dire, car la balle est derrière le panneau et ne se voit pas."),
-        ("Spanish", "No se puede saber con el video, porque la bola está detrás del panel y no se ve."),
-        ("Italian", "Non si può dire, perché la palla è dietro il pannello e il risultato non si vede nel video."),
-        ("Portuguese", "Não é possível dizer, porque a bola está atrás do painel e o resultado não se vê no vídeo."),
-        ("Dutch", "Het is niet te zien, want de bal is achter het paneel en wordt niet getoond in de video."),
-    ],
-)
-def test_an_answer_in_another_language_of_the_same_script_is_degenerate(spoken: str, text: str) -> None:
-    plain = "It would be in the left bin, since the ball rolls to that side of the ramp."
-    assert language(text) == spoken
-    assert degeneracy(text, "answer", plain) == (None if spoken == "English" else "language")
-    assert degeneracy(plain, "answer", text) == (None if spoken == "English" else "language")
-    assert degeneracy(text, "answer", text) is None
-
-
-@pytest.mark.parametrize("short", ["Left.", "The die lands on 4.", "A: die B", "No.", "la la la", ""])
-def test_a_short_answer_shows_no_language_that_could_be_wrong(short: str) -> None:
-    assert language(short) == ""

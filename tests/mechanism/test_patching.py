@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from accelerate.hooks import AlignDevicesHook, add_hook_to_module, remove_hook_from_module
 
 from tests import local_models
 from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
@@ -192,6 +193,24 @@ def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(name: str) -> None
         expected = (torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0)).item()
         change = patched_changes(of, target, source, [Patch(site, layer, chosen.numpy())], tokens)[0]
         assert target.margin + change == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_pass_of_a_spread_model_begins_at_the_patched_block_and_leaves_its_hooks_of_devices() -> None:
+    """accelerate replaces the `forward` of every block, which is replaced in turn by a pass that begins behind it."""
+    of, target, source, tokens, *_ = pair("qwen3-vl")
+    whole = [Patch("residual", layer, np.ones(target.length, bool)) for layer in (1, 3)]
+    expected = patched_changes(of, target, source, whole, tokens)
+    for block in of.blocks:
+        add_hook_to_module(block, AlignDevicesHook(execution_device="cpu"))
+    try:
+        placed = [vars(block)["forward"] for block in of.blocks]
+        assert patched_changes(of, target, source, whole, tokens) == pytest.approx(expected)
+        assert [vars(block)["forward"] for block in of.blocks] == placed
+    finally:
+        for block in of.blocks:
+            remove_hook_from_module(block)
+            vars(block).pop("forward", None)
+    assert patched_changes(of, target, source, whole, tokens) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("name", PATCHABLE)

@@ -19,11 +19,9 @@ from tests.build.mechanism import STANDARD, entry, extract_all, own, patch, stud
 from tests.conftest import ROOT
 from tests.mechanism.steer_cell import CELL
 from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
-from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
-from traps_pipeline.mechanism.baselines import baseline_rows
 from traps_pipeline.mechanism.cosines import cosine_rows
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
@@ -51,7 +49,7 @@ from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
-from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Asked, MechanismSettings
@@ -177,7 +175,7 @@ def test_directions_are_what_the_states_say(study: Workspace) -> None:
     difference = at[chosen & void].mean(axis=0) - at[chosen & ~void].mean(axis=0)
     saved = stages.saved_directions(study, STANDARD)["occlusion"].void[2]
     assert np.allclose(saved, difference / np.linalg.norm(difference), atol=1e-6)
-    assert row["direction_digest"] == vector_digest(saved) and row["n_pairs"] == 3 and row["n_steered"] == 1
+    assert row["direction_digest"] == vector_digest(saved) and row["n_pairs"] == 3
     assert row["norm"] == pytest.approx(np.linalg.norm(difference), rel=1e-5)
     assert row["residual_norm"] == pytest.approx(np.linalg.norm(at[chosen & ~void], axis=1).mean(), rel=1e-5)
     cosines = pd.DataFrame(cosine_rows(study))
@@ -268,12 +266,13 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     cells = [SteeringCell.make(dataset, "tiny", "standard", "guided") for dataset in DATASETS]
     along = {"standard": stages.saved_directions(study, STANDARD)}
     done = written(study, STEERING, collect_steered(study, entry, cells, along))
-    # chaotic: 4 sources x 3 doses x 4 rows; + on both sides 3 x 4, of which the controls are asked already; 2 nulls x 4
-    # rows at the largest dose; the sweep's 2 x 2 controls; 4 rows as they are
+    # Of the two scenarios a well-posed direction comes from one, so its own taxonomy has one. chaotic: 3 doses on both
+    # sides of 1 + 2 + 2 + 2 scenarios; + on both sides 3 x 2, of which the controls are asked already; 2 nulls x 2 rows
+    # at the largest dose; the sweep's 2 controls; 4 rows as they are
     rows = {cell.dataset: (len(made.rows(STEERING)), made.tally.asked) for cell, made in done}
-    assert rows["chaotic"] == rows["occlusion"] == (76, 70)
+    assert rows["chaotic"] == rows["occlusion"] == (58, 55)
     # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, its nulls, and its sweep
-    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (64, 3 * 3 * 2 + 3 * 2 + 2 * 4 + 2 * 2 + 2)
+    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (58, 3 * 5 + 3 * 2 + 2 * 4 + 2 * 2 + 2)
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
     assert planned["guided"].total() == sum(asked for _, asked in rows.values()) and set(planned) == {"guided"}
     votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
@@ -312,17 +311,24 @@ def test_who_may_not_write_a_cell_makes_its_answers_and_a_killed_process_gives_i
             first.kill()
             first.wait()
             known = wait_for(1, second := start(own.root))
-            assert wait_for(9, second) == 70  # 70 answers in chunks of 8
+            assert wait_for(7, second) == 55  # 55 answers in chunks of 8
             return known, second
 
     known, process = asyncio.run(helped())
     output, _ = process.communicate()
     said, alone_said = json.loads(output.splitlines()[-1]), None
-    assert process.returncode == 0 and known >= 6 and said["generated"] == 70 - known
+    assert process.returncode == 0 and known >= 6 and said["generated"] == 55 - known
     process = start(alone)
     alone_said = json.loads(process.communicate()[0].splitlines()[-1])
-    assert alone_said["generated"] == 70 and said["texts"] == alone_said["texts"]
-    assert not made.exists() and len(own.answers.read(CELL.evaluation.key).rows) == 70
+    assert alone_said["generated"] == 55 and said["texts"] == alone_said["texts"]
+    assert not made.exists() and len(own.answers.read(CELL.evaluation.key).rows) == 55
+
+
+def test_no_answer_is_steered_along_a_direction_that_comes_from_its_scenario(steered: Workspace) -> None:
+    answers = steered.tables.read_all(STEERING).query(f"kind != '{UNSTEERED}'")
+    of = stages.saved_directions(steered, STANDARD)
+    assert of["chaotic"].scenarios & {*steered.tables.read_all(STEERING)["scenario_id"]}
+    assert not [1 for row in answers.to_dict("records") if row["scenario_id"] in of[row["source"]].scenarios]
 
 
 def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntry) -> None:
@@ -386,7 +392,11 @@ def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> N
     effects = effects_of_wrong_answers(steered)
     main = of_paper(effects).query("layer == 2")
     assert len(main.groupby(["source", "target"])) == 14
-    assert set(main["alpha"]) == {0, 2, 8} and (main["n"] + main["n_missing"] == 2).all()
+    answers = main["n"] + main["n_missing"]  # at alpha 0 as many: the path's own scenarios, not all
+    own = main["source"].isin(["occlusion", "chaotic"]) & (
+        main["source"].map(taxonomy_of) == main["target"].map(taxonomy_of)
+    )
+    assert set(main["alpha"]) == {0, 2, 8} and (answers == np.where(own, 1, 2)).all()
     plain = main.query("alpha == 0 and target == 'chaotic'")
     assert plain.groupby("side")["abstained"].nunique().max() == 1
     assert set(effects.query("layer == 1")["side"]) == {"control"}  # the sweep
@@ -406,46 +416,6 @@ def test_nulls_and_policies_stand_beside_every_own_direction(steered: Workspace)
     assert (label["acc"].dropna() == plus["acc"].dropna()).all()  # controls are the same under both policies
 
 
-def test_other_interventions_and_probes_stand_in_the_tables_like_the_built_in_ones(
-    own: Workspace, entry: ModelEntry
-) -> None:
-    """Project out and clamp are asked, judged and counted as steered answers are; other probes beside the baselines."""
-    settings = own.mechanism
-    assert settings.steering is not None
-    changed = settings.steering.model_copy(update={"alphas": (2.0,), "project_out": (1.0,), "clamp": (-0.5, 2.0)})
-    probes = settings.probes.model_copy(update={"others": ("mean difference", "LinearSVC")})
-    own = own.allow(mechanism=settings.model_copy(update={"steering": changed, "probes": probes}))
-    cells = [SteeringCell.make("chaotic", "tiny", "standard", "guided")]
-    along = {"standard": stages.saved_directions(own, STANDARD)}
-    ((_, done),) = written(own, STEERING, collect_steered(own, entry, cells, along))
-    # 4 sources x 2 doses x 4 rows; + on both sides, of which the controls are there; 3 interventions x 4; 2 nulls x 4
-    # at the largest dose; the sweep's 2 controls; 4 rows as they are
-    assert done.shown["wanted"] == 32 + 4 + 12 + 8 + 2 + 4
-    with_others, without = (
-        count_answers(of, "tiny", ["chaotic"], {"chaotic": PAIRS})["guided"].total() for of in (own.mechanism, settings)
-    )
-    assert with_others - without == 12 - 4 - 2 - 2  # without one alpha: 4 rows by label, 2 voids by +, 2 of the sweep
-    written(own, STEERING_VOTES, collect_steering_votes(own, cells))
-    answers, votes = own.tables.read_all(STEERING), own.tables.read_all(STEERING_VOTES)
-    effects = pd.DataFrame([vars(row) for row in effect_rows(answers, votes)])
-    doses = [("project out", 0.0), ("project out", 1.0), ("clamp", -0.5), ("clamp", 0.0), ("clamp", 2.0)]
-    for unit, dose in doses:
-        there = effects.query(f"unit == '{unit}' and dose == {dose}")
-        void, control = (there.query(f"side == '{side}'") for side in ("void", "control"))
-        assert len(void) == len(control) == 1 and set(void["signs"]) == {"plus"}
-        assert void["n"].item() + void["n_missing"].item() == control["n"].item() + control["n_missing"].item() == 2
-    gap = along["standard"]["chaotic"].gaps[2]
-    assert set(effects.query("unit == 'clamp' and dose == 2")["alpha"]) == {float(2 * gap)}
-    assert set(effects.query("unit == 'project out'")["alpha"]) == {0.0}
-    assert len(of_paper(answers).query("alpha > 0")["unit"].unique()) == 1  # the paper's figures see alphas alone
-
-    found = pd.DataFrame([vars(row) for row in baseline_rows(own, entry, StoredStates.of(own, STANDARD))])
-    assert {"states, mean difference", "states, LinearSVC", "question words"} <= set(found["features"])
-    theirs = inside.protocol(own, "tiny", layer=2, fit="mean difference")
-    ours = found.query("features == 'states, mean difference'")
-    assert list(ours["value"]) == list(theirs["value"]) and list(ours["low"]) == list(theirs["low"])
-
-
 def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace) -> None:
     directions, settings = stages.saved_directions(study, STANDARD), study.mechanism
     wrong = settings.models["tiny"].model_copy(update={"steering": 5})
@@ -462,7 +432,10 @@ def test_settings_that_cannot_be_are_refused() -> None:
     for wrong, message in (
         ({"models": {}}, "at least 1"),
         ({"models": layers, "probes": {"shuffles": 5}}, "greater than or equal to 20"),
-        ({"models": layers, "prompts": ["standard"]}, "are not among the prompts"),
+        (
+            {"models": layers, "prompts": ["standard"], "steering": {"direction_regimes": ["guided"]}},
+            "are not among the prompts",
+        ),
         (
             {"models": layers, "prompts": ["standard"], "steering": None, "probes": {"prompts": ["guided"]}},
             "probes.prompts: .'guided'. are not among the prompts",

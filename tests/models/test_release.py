@@ -90,7 +90,7 @@ def test_an_account_that_several_studies_share_gets_the_money_back_too(blocked: 
 def test_the_command_lists_and_releases_and_wants_a_reason(
     blocked: Workspace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["ledger", "release", "--workspace", str(blocked.root)]
+    command = ["study", "release-money", "--workspace", str(blocked.root)]
     assert main(command) == 0
     assert capsys.readouterr().out.splitlines()[1].split() == ["m", "1.0000", "3.0000"]
     assert main([*command, "--participant", "m", "--all-in-flight"]) == 1

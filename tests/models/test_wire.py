@@ -311,7 +311,7 @@ def test_an_answer_that_is_none_is_told_in_a_sentence_of_ours(capsys: pytest.Cap
         outcome, _ = call(f"http://127.0.0.1:{provider.port}/v1", retries=0)
     assert outcome and (outcome.kind, outcome.raw) == ("malformed", "<h1>Sign in, ***</h1>")
     said = capsys.readouterr().err
-    assert "m: malformed (a run tries again): it sent a page of HTML" in said
+    assert "m: its answer cannot be read; a run tries again (malformed: it sent a page of HTML" in said
     assert "Traceback" not in said and "litellm" not in said and SECRET not in said
 
 

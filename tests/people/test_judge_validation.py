@@ -139,13 +139,13 @@ def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
     workspace = labelled_study(tmp_path / "study", texts)
     sheet, filled = tmp_path / "sheet.csv", tmp_path / "filled.csv"
     at = ("--workspace", str(workspace.root))
-    assert main(["confabulation", "sheet", str(sheet), *at]) == 0
+    assert main(["people", "sheet", str(sheet), *at]) == 0
     assert "4 failures in" in capsys.readouterr().out
     rows = list(csv.DictReader(sheet.open(newline="")))
     assert MODEL not in sheet.read_text() and "chaotic" not in sheet.read_text()
     assert {row["response"] for row in rows} == {"It goes left.", "'=HYPERLINK(1)", texts[2], "Left."}
     assert {row["reasoning_trace"] for row in rows} == {""}  # the judge saw none
-    assert main(["confabulation", "sheet", str(sheet), *at]) == 1  # it may hold labels by now
+    assert main(["people", "sheet", str(sheet), *at]) == 1  # it may hold labels by now
     assert "exists already" in capsys.readouterr().err
 
     with filled.open("w", newline="") as stream:
@@ -154,7 +154,7 @@ def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
         for who in ("ann", "bob"):
             said = dict.fromkeys(AXES, "no") | {"hallucinated_premise": "yes", "annotator": who}
             writer.writerows([row | said for row in rows])
-    assert main(["confabulation", "validate", str(filled), *at]) == 0
+    assert main(["people", "validate", str(filled), *at]) == 0
     out = capsys.readouterr().out
     assert "judge against ann (A) and bob (B), 4 failures" in out
     (line,) = (line for line in out.splitlines() if line.startswith("hallucinated_premise"))
@@ -173,7 +173,7 @@ def test_labels_of_an_earlier_answer_are_not_put_before_people(
     rows = workspace.tables.read(table, partition)
     workspace.tables.write(table, partition, rows.assign(text="Right.") if gone == "the answer" else rows[:0], {})
     sheet = tmp_path / "sheet.csv"
-    assert main(["confabulation", "sheet", str(sheet), "--workspace", str(workspace.root)]) == 1
+    assert main(["people", "sheet", str(sheet), "--workspace", str(workspace.root)]) == 1
     assert "are of earlier answers (of chaotic:s-0000:void, for one); materialize" in capsys.readouterr().err
     assert not sheet.exists()
 
@@ -183,8 +183,8 @@ def test_without_a_labelled_failure_there_is_nothing_to_compare(
 ) -> None:
     workspace = answered_study(tmp_path / "study", {})
     at = ("--workspace", str(workspace.root))
-    assert main(["confabulation", "validate", str(written(tmp_path, HEAD, *GOOD)), *at]) == 1
+    assert main(["people", "validate", str(written(tmp_path, HEAD, *GOOD)), *at]) == 1
     assert "materialize confabulation" in capsys.readouterr().err
     workspace.tables.write(CONFABULATION, {}, [], {})
-    assert main(["confabulation", "validate", str(written(tmp_path, HEAD, *GOOD)), *at]) == 1
+    assert main(["people", "validate", str(written(tmp_path, HEAD, *GOOD)), *at]) == 1
     assert "no labelled failure to compare with" in capsys.readouterr().err

@@ -12,10 +12,10 @@ from tests.conftest import Checkout, once
 
 @pytest.fixture(scope="session")
 def released(demo: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `traps release` writes of the demo. Read only."""
+    """What `traps publish release` writes of the demo. Read only."""
 
     def make(folder: Path) -> str:
-        finished = demo.traps("release", folder, "--date", "2026-11-22")
+        finished = demo.traps("publish", "release", folder, "--date", "2026-11-22")
         assert finished.code == 0, finished.err
         return finished.out
 

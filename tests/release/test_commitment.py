@@ -44,7 +44,7 @@ def problems(folder: Path) -> list[str]:
 
 def test_the_seed_draws_the_committed_records_again(committed: Path, demo: Checkout) -> None:
     given = committed / "commitment.json", committed / "reveal.json", "--specs", committed / "private"
-    finished = demo.traps("verify-commitment", *given, "--workers", "1")
+    finished = demo.traps("benchmark", "prove", *given, "--workers", "1")
     assert finished.code == 0, finished.out + finished.err
     assert finished.out.splitlines()[-1].endswith("are the committed ones, and the revealed seed draws them")
 
@@ -77,7 +77,7 @@ def test_another_seed_or_number_is_refused_before_anything_is_drawn(
     copy: Path, demo: Checkout, change: dict[str, Any]
 ) -> None:
     reveal = edit(copy / "reveal.json", **change)
-    finished = demo.traps("verify-commitment", copy / "commitment.json", reveal, "--specs", copy / "private")
+    finished = demo.traps("benchmark", "prove", copy / "commitment.json", reveal, "--specs", copy / "private")
     assert finished.code == 1 and "drawing" not in finished.out
     assert "the revealed seed, number or composition is not the one that was committed" in finished.out
 
@@ -111,7 +111,7 @@ def test_a_family_without_a_number_is_sampled_with_one(copy: Path, tmp_path: Pat
     composition = checkout.root / "scene_specs" / "composition.yaml"
     lines = composition.read_text().splitlines(keepends=True)
     composition.write_text("".join(line for line in lines if not line.startswith("hidden_drop:")))
-    sample = ("sample", "--seed", "2026", "--families", "hidden_drop", "--out", copy / "private")
+    sample = ("benchmark", "sample", "--seed", "2026", "--families", "hidden_drop", "--out", copy / "private")
     refused = checkout.traps(*sample)
     assert refused.code == 1
     assert "composition.yaml has no number of scenarios for hidden_drop; say --count N" in refused.err

@@ -122,7 +122,7 @@ def test_a_changed_a_swapped_a_removed_and_an_added_file_are_each_named(copy: Pa
         "prompts.jsonl: is missing",
         "scenarios.jsonl: is altered",
     ]
-    finished = demo.traps("verify", copy)
+    finished = demo.traps("publish", "verify", copy)
     assert finished.code == 1 and "4 of its files are not what was released" in finished.err
 
 
@@ -161,7 +161,7 @@ def test_a_held_out_set_tells_no_side_no_pair_and_no_answer(workspace: Workspace
 def test_a_clip_that_is_not_its_items_is_named_and_nothing_is_written(demo_study: Checkout, tmp_path: Path) -> None:
     clip = next((demo_study.workspace / "clips" / "plinko-0001").glob("void*.mp4"))
     clip.write_bytes(b"other")
-    finished = demo_study.traps("release", tmp_path / "out")
+    finished = demo_study.traps("publish", "release", tmp_path / "out")
     assert finished.code == 1 and f"{clip}: is missing or not the clip of its item" in finished.err
     assert not (tmp_path / "out").exists()
 

@@ -256,7 +256,7 @@ def test_an_inspect_log_is_imported_by_item(
     (log,) = (inspected[1] / model).iterdir()
     assert log.suffix == (".json" if model == "oracle" else ".eval")
     shutil.rmtree(demo_study.workspace / "ledger" / "answers")
-    finished = demo_study.traps("answers", "import", "demo", log, "--model", model)
+    finished = demo_study.traps("study", "import-answers", "demo", log, "--model", model)
     assert finished.code == 0 and finished.out.startswith("128 answers imported, 0 were there already"), finished.err
     given = json.loads(answers.read_text())["standard"][model]
     assert imported_texts(Workspace.open(demo_study.workspace), model, "standard") == given
@@ -284,7 +284,7 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     path = tmp_path / "answers.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     (tmp_path / "key").write_text("00" * 32)
-    command = ("answers", "import", unasked.root / EXPERIMENT, path, "--model", "random-50")
+    command = ("study", "import-answers", unasked.root / EXPERIMENT, path, "--model", "random-50")
     refused = unasked.traps(*command)
     assert refused.code == 1 and "under json, run 1, is not wanted of random-50" in refused.err
     finished = unasked.traps(*command, "--key", tmp_path / "key")

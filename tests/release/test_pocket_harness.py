@@ -55,7 +55,7 @@ class Served:
 
 
 def logged(path: Path) -> dict[str, tuple[str, str]]:
-    """Outcomes and texts by item as `traps answers import` reads them from a harness's log."""
+    """Outcomes and texts by item as `traps study import-answers` reads them from a harness's log."""
     read = reader_of(path)
     assert read is not None
     return {one.item: (one.answer["outcome"], one.answer["text"]) for one in read(path)}

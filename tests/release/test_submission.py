@@ -81,9 +81,9 @@ def test_a_study_packed_twice_is_the_same_file_and_holds_against_its_release(
     packed: Path, release: Path, small: Checkout, tmp_path: Path
 ) -> None:
     again = tmp_path / "again.zip"
-    packing = small.traps("submit", again, "--name", "small")
+    packing = small.traps("publish", "submit", again, "--name", "small")
     assert packing.code == 0 and again.read_bytes() == packed.read_bytes()
-    finished = small.traps("verify", again, "--release", release)
+    finished = small.traps("publish", "verify", again, "--release", release)
     assert finished.code == 0 and finished.out.splitlines()[-1] == f"{again}: holds"
     assert "not checked: that the answers are the model's" in finished.out
     # 12 scenarios x 2 datasets x 2 sides; 3 models x 2 regimes; three judges on two tasks of a control, one of a void
@@ -270,7 +270,7 @@ def test_a_forged_submission_is_not_ranked_and_its_reason_is_on_the_page(
         put(frames, LEADERBOARD.name, "pecs", 1.0, model="prior", regime="json", dataset="overall")
 
     path = forged(packed, tmp_path / "forged.zip", edit, name="forged")
-    finished = small.traps("leaderboard", packed, path, "--out", tmp_path / "board")
+    finished = small.traps("publish", "leaderboard", packed, path, "--out", tmp_path / "board")
     assert finished.code == 1 and "refused: forged.zip: leaderboard prior json overall: pecs is 1.0" in finished.out
     page = (tmp_path / "board" / "index.html").read_text()
     assert "leaderboard prior json overall: pecs is 1.0, the votes give 0.0" in page

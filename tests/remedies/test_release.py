@@ -123,9 +123,9 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     assert told in verify(submission).unchecked
     assert told not in verify(submission, release).unchecked
     remedied(
-        lambda: command("verify", path, "--key", tmp_path / "key.pub"),
+        lambda: command("publish", "verify", path, "--key", tmp_path / "key.pub"),
         "cli.release.verify",
-        again=lambda: command("verify", path),
+        again=lambda: command("publish", "verify", path),
     )
     root = tmp_path / "study"
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))

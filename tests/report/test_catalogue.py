@@ -332,7 +332,7 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     chosen = [next(r for r in FIGURES if r.name == "doubt_conversion")]
     monkeypatch.setattr(publish, "FIGURES", chosen)
     monkeypatch.setattr(publish, "TABLES", TABLES[:2])
-    assert main(["export", str(tmp_path), "--workspace", str(workspace.root)]) == 0
+    assert main(["results", "export", str(tmp_path), "--workspace", str(workspace.root)]) == 0
     files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
     assert {f"tables/published/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")} <= files
     assert {

@@ -19,6 +19,7 @@ from traps_pipeline.mechanism.control_rows import (
     PATCHING,
     PROBE_BASELINES,
     RISK_COVERAGE,
+    SENTENCES,
     STEERING_NULLS,
     STEERING_PECS,
 )
@@ -109,6 +110,13 @@ def item_scores() -> pd.DataFrame:
     return frame(ITEM_SCORES, *rows)
 
 
+def sentences() -> pd.DataFrame:
+    """Of the same items, how likely abstentions are: of the first void least, of the second as of the first control."""
+    scored = (-3.0, -1.0, -1.0, -2.0)
+    rows = [{"item_id": str(n), "abstention": abstention, "own": -0.5} for n, abstention in enumerate(scored)]
+    return frame(SENTENCES, *rows)
+
+
 def lens() -> pd.DataFrame:
     at = {("standard", 1): (-4, -5), ("guided", 1): (-4, -5), ("standard", 2): (-6, -9), ("guided", 2): (1, -8)}
     rows = [
@@ -149,6 +157,7 @@ class Made(Results):
         "patching": lambda _: patching(),
         "item_scores": lambda _: item_scores(),
         "lens": lambda _: lens(),
+        "sentences": lambda _: sentences(),
         "nulls": lambda _: nulls(),
         "own_effects": lambda _: own_effects(effects()),
     }
@@ -244,8 +253,8 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
 
 FINDINGS = {
     "states_and_output": "m answered 2 voids under standard: its states put 2 of them among voids (and 0 of 2 "
-    "controls), its output 0; as an order of the sides, the AUROC of states is 1.00 and of output 0.75 (mean of "
-    "datasets).",
+    "controls), its output 0; as orders of the sides (AUROC, mean of datasets): states 1.00, first token 0.75, "
+    "whole abstentions 0.38.",
     "lens": "In m the guided prompt moves the log-odds of abstaining by +7.0 on voids and +1.0 on controls at the last "
     "layer, and by +0.0 and +0.0 one layer before (means over datasets).",
     "probe_baselines": "m: states are above every raw input, the output margin and noise on 0 of 1 pairs of datasets, "
@@ -331,7 +340,7 @@ def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> No
     assert max(made.own_effects["gaps"]) == pytest.approx(20.0)
     (axes,) = next(report for report in FIGURES if report.name == "doses_among_nulls").make(made).axes
     assert axes.get_xlim()[1] < 2.5
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.5", "1", "+", "−"]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "1", "+", "−"]
 
 
 @pytest.mark.parametrize("name", ["gate_arrows", "doses_among_nulls"])

@@ -99,13 +99,13 @@ def test_a_large_cell_has_pages_that_lead_to_each_other_with_both_sides_on_each(
 
 
 def test_cells_of_arms_have_pages_behind_those_of_the_pairs(workspace, tmp_path):
-    arm = Cell("held_void", CELL.evaluation)
+    arm = Cell("crossed", CELL.evaluation)
     for cell in (arm, CELL):
         write_cell(workspace, cell)
     assert write_item_pages(workspace, tmp_path, None) == [CELL, arm]
-    assert "Arm: held void" in (tmp_path / page_name(arm)).read_text()
+    assert "Arm: crossed" in (tmp_path / page_name(arm)).read_text()
     index = (tmp_path / "index.html").read_text()
-    assert index.index("<th>Chaotic</th>") < index.index("<th>Arm: held void</th>")
+    assert index.index("<th>Chaotic</th>") < index.index("<th>Arm: crossed</th>")
     assert page_name(arm) in index
 
 

@@ -395,8 +395,8 @@ def test_the_worked_example_is_a_pair_with_both_answers_and_their_verdicts(tmp_p
 def test_the_sheet_of_arms_takes_the_scenario_with_most_arms_and_draws_a_row_a_clip(tmp_path):
     rows = [row for s in ("plinko-0", "plinko-1") for row in pair_rows(s, tmp_path)]
     items = pd.DataFrame(rows).assign(taxonomy="chaotic")
-    held = {"arm": "held_void", "side": "void", "question": "Where?", "ground_truth": None}
-    swapped = {"arm": "choices_swapped", "side": "control", "question": "Where is it?", "ground_truth": "left"}
+    held = {"arm": "crossed", "side": "void", "question": "Where?", "ground_truth": None}
+    swapped = {"arm": "twin_control", "side": "control", "question": "Where is it?", "ground_truth": "left"}
     filmed = [("plinko-0", held), ("plinko-1", held), ("plinko-1", swapped)]
     arms = pd.DataFrame([{"scenario_id": s, "clip": f"{s}-void.mp4", **arm} for s, arm in filmed])
     (png,) = arms_sheets(items, arms, tmp_path).values()

@@ -1,4 +1,4 @@
-"""PECS-R and gap on the printed leaderboard: only where an arm was run, with the number of arms behind them."""
+"""Figures of arms on the printed leaderboard: only where an arm was run, with the arms behind them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ from traps_pipeline.scoring.score_rows import ROBUST
 BOARD = board_of(*(board_row(model, dataset=d) for model in ("asked", "alone") for d in ("overall", *DATASETS)))
 
 
+HEADINGS = ("Conjunction %", "Robust", "Inferred %")
+
+
 def robust_of(**values: Any) -> pd.DataFrame:
     """A ROBUST row of `asked`."""
-    figures = {"arms": [*ARMS], "pecs": 0.25, "pecs_r": 0.05, "gap": 0.2, "refused": None}
+    figures = {"arms": [*ARMS], "conjunction": 0.125, "robust": 0.05, "inference_acc": 0.625, "refused": None}
     return pd.DataFrame([vars(row(ROBUST, model="asked", regime="standard", **figures | values))])
 
 
@@ -30,46 +33,39 @@ def shown(robust: pd.DataFrame | None, board: pd.DataFrame = BOARD) -> list[str]
 def test_without_any_arm_the_leaderboard_is_what_it_was_byte_for_byte() -> None:
     before = [leaderboard_text(BOARD), leaderboard_markdown(BOARD), report_html(BOARD)]
     assert shown(None) == shown(robust_of().iloc[:0]) == before
-    assert not [text for text in before if "PECS-R" in text or ">gap<" in text]
+    assert not [text for text in before if any(heading in text for heading in HEADINGS)]
 
 
-def test_an_entry_with_arms_has_pecs_r_and_gap_and_one_without_says_not_run() -> None:
+def test_an_entry_with_arms_has_their_figures_and_one_without_says_not_run() -> None:
     cells = {line.heading: column for line, column in _columns(robust_of())}
-    assert (cells["PECS-R"], cells["gap"]) == (["not run", "0.050"], ["not run", "0.200"])
+    assert [cells[heading] for heading in HEADINGS] == [["not run", said] for said in ("12.5", "0.050", "62.5")]
     for text in shown(robust_of()):
-        assert text.count("not run") >= 2
-        assert "0.050" in text
-        assert f"over {len(ARMS)} of {len(ARMS)} arms: decoy, " in text.replace("\\", "")
-
-
-def test_over_some_arms_pecs_r_carries_their_number_and_a_note_names_them() -> None:
-    cells = {line.heading: column for line, column in _columns(robust_of(arms=["decoy", "held_void"]))}
-    assert cells["PECS-R"] == ["not run", f"0.050 (2 of {len(ARMS)} arms)"]
-    for text in shown(robust_of(arms=["decoy", "held_void"])):
-        assert f"PECS-R is over 2 of {len(ARMS)} arms: decoy, held_void" in text.replace("\\", "")
+        assert text.count("not run") >= 3 and "0.050" in text
+        assert f"all over {len(ARMS)} of {len(ARMS)} arms: decoy, " in text.replace("\\", "")
 
 
 def test_entries_over_different_arms_are_told_apart() -> None:
-    both = pd.concat([robust_of(arms=["decoy"]), robust_of(arms=["held_void"]).assign(model="alone")])
+    both = pd.concat([robust_of(arms=["decoy"]), robust_of(arms=["crossed"]).assign(model="alone")])
     for text in shown(both):
         plain = text.replace("\\", "")
-        assert "PECS-R of asked standard is over 1 of" in plain
-        assert "PECS-R of alone standard is over 1 of" in plain
+        assert f"asked standard over 1 of {len(ARMS)} arms: decoy" in plain
+        assert f"alone standard over 1 of {len(ARMS)} arms: crossed" in plain
 
 
-def test_a_refused_gap_is_a_dash_with_its_reason() -> None:
-    refused = robust_of(gap=np.nan, refused="pairs of epoch e1, arms of epoch e2")
-    assert {line.heading: column for line, column in _columns(refused)}["gap"] == ["not run", "–"]
+def test_figures_that_cannot_join_pairs_and_arms_are_dashes_with_the_reason() -> None:
+    refused = robust_of(conjunction=np.nan, robust=np.nan, refused="pairs of epoch e1, arms of epoch e2")
+    cells = {line.heading: column for line, column in _columns(refused)}
+    assert cells["Conjunction %"] == cells["Robust"] == ["not run", "–"]
     for text in shown(refused):
-        assert "no gap: pairs of epoch e1, arms of epoch e2" in text
+        assert "no conjunction and no robust figure: pairs of epoch e1, arms of epoch e2" in text
 
 
-def test_other_columns_stay_as_they_are_and_datasets_have_no_pecs_r() -> None:
+def test_other_columns_stay_as_they_are_and_datasets_have_no_figure_of_arms() -> None:
     overall, *datasets = leaderboards(BOARD, robust_of())
     plain = leaderboards(BOARD)[0]
-    assert [c for c in overall.columns if c.heading not in ("PECS-R", "gap")] == plain.columns
+    assert [c for c in overall.columns if c.heading not in HEADINGS] == plain.columns
     assert overall.rows[plain.rows.columns].equals(plain.rows)
-    assert not [table for table in datasets if "PECS-R" in [column.heading for column in table.columns]]
+    assert not [table for table in datasets if {*HEADINGS} & {column.heading for column in table.columns}]
     assert tables(BOARD)[0][0]["PECS"] == "0.250"
 
 

@@ -10,10 +10,9 @@ import pytest
 
 from tests.scenes import arm_table
 from tests.scenes.released import load
+from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.protocol.datasets import ARMS, arms_of, sides_of
-from traps_pipeline.scenes.parts.offers import with_choices, without_choices
-from traps_pipeline.scenes.parts.wording import refutation
 from traps_pipeline.scenes.picture.camera import Panel
 from traps_pipeline.scenes.variants import arms
 from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -31,8 +30,8 @@ def test_every_arm_that_can_be_asked_can_be_filmed_and_asks_its_sides():
     assert set(arms.ARMS) == set(ARMS)
     plinko = load_released()["plinko-0001"]
     for name in arms_of("chaotic"):
-        assert tuple(question.side for question in arms.ARMS[name].ask(plinko)) == sides_of(name)
-    assert set(arms_of("occlusion")) & set(arms_of("chaotic")) == {"twin_control", "choices_swapped"}
+        assert tuple(question.side for question in arm_of(plinko, name).ask(plinko)) == sides_of(name)
+    assert set(arms_of("occlusion")) & set(arms_of("chaotic")) == {"twin_control", "crossed"}
 
 
 def test_the_page_has_the_table_of_arms():
@@ -42,48 +41,28 @@ def test_the_page_has_the_table_of_arms():
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("question", "labels", "plain"),
-    [
-        ("Does the red ball fall, yes or no?", ("yes", "no"), "Does the red ball fall?"),
-        ("Which ball is first: red, blue or green?", ("green", "red", "blue"), "Which ball is first?"),
-        ("Where does it end: in the left bin (red) or somewhere else?", ("left", "other"), "Where does it end?"),
-        (
-            "In which bucket, 1, 2 or 3 from left to right, does it rest?",
-            ("1", "2", "3"),
-            "In which bucket does it rest?",
-        ),
-        ("Does it go into the red bin on the left or on the right?", ("left", "right"), None),
-        ("Count the dominoes: are they 1-2, 3-4 or 5-6?", ("1-2", "3-4", "5-6"), None),
-    ],
-)
-def test_choices_are_taken_from_a_question_or_it_is_left_alone(
-    question: str, labels: tuple[str, ...], plain: str | None
-):
-    assert without_choices(question, labels) == plain
+def test_partners_refute_each_others_question_and_nobody_has_two():
+    specs = load_released()
+    by_family = [[spec for spec in specs.values() if spec.family == family] for family in ("plinko", "hidden_race")]
+    for members in by_family:
+        chosen = arms.partners(members)
+        assert len(chosen) >= 0.9 * len(members)
+        for one, other in chosen.items():
+            assert one != other and chosen[other] == one
+            control, void = arms.crossed(specs[other]).ask(specs[one])
+            assert void.text == specs[other].question and void.clip == "control" and void.answer is None
+            assert (control.text, control.clip) == (specs[one].answerable_question.question, "void")
+            scene = scenario(one)
+            assert arms.crossed(specs[other]).film(scene).evidence["refuted_by"].startswith("nothing is ")
+    assert arms.partners(by_family[0][:1]) == {}
 
 
-def test_no_released_question_offers_choices_once_they_are_swapped_and_every_ill_posed_one_does():
-    refused = 0
-    for spec in load_released().values():
-        try:
-            well_posed, ill_posed = arms.ARMS["choices_swapped"].ask(spec)
-        except Rejected:
-            refused += 1
-            continue
-        assert " or " not in well_posed.text and well_posed.text.endswith("?"), well_posed.text
-        assert " or " in ill_posed.text and ill_posed.text.endswith("?"), ill_posed.text
-        assert spec.question.startswith(well_posed.text[:8]) and well_posed.answer == spec.ground_truth
-        assert ill_posed.answer is None
-        if spec.taxonomy == "occlusion":  # what it asks for is still what no video shows
-            assert refutation("occlusion", ill_posed.text, None) is not None  # type: ignore[arg-type]
-    assert refused < 40  # choices that are part of their sentence: 'the bin on the left or on the right'
-
-
-def test_an_ill_posed_question_that_offers_choices_keeps_them():
-    assert with_choices("Is the ball hollow or solid?") == "Is the ball hollow or solid?"
-    assert with_choices("How many grams does the cup weigh?") == "How many grams does the cup weigh: 20, 80 or 300?"
-    assert with_choices("Why is the ball singing?") is None
+def test_a_scenario_without_a_partner_or_with_one_that_its_scene_does_not_refute_is_not_crossed():
+    race = scenario("hidden_race-0001")
+    with pytest.raises(Rejected, match="it has no partner"):
+        arms.crossed(None).ask(race.spec)
+    with pytest.raises(Rejected, match="the scene does not refute 'Which ball"):
+        arms.crossed(race.spec).film(race)
 
 
 # --- clips ------------------------------------------------------------------------------------------------------------
@@ -126,21 +105,9 @@ def test_a_race_whose_worlds_look_alike_until_it_is_won_has_no_late_panel():
 
 
 @pytest.mark.slow
-def test_a_camera_that_looks_past_the_outcome_shows_the_cause_and_no_trace_of_the_rest():
-    slide = scenario("slide-0001")
-    take = arms.ARMS["frame_out"].film(slide)
-    assert take.evidence["cause_px"] >= arms.SEEN_PX
-    assert take.evidence["twin_px"] == take.evidence["ablation_px"] == 0
-    assert take.evidence["hidden_from_s"] * slide.fps < slide.control.outcome.commit_frame
-
-
-@pytest.mark.slow
-def test_cuts_of_a_board_are_held_matched_and_predictable_and_a_settled_one_is_not():
+def test_cuts_of_a_board_are_matched_and_predictable_and_a_settled_one_is_not():
     plinko = scenario("plinko-0001")
     cut = plinko.spec.void["cut_frame"]
-    held = arms.ARMS["held_void"].film(plinko)
-    assert len(held.frames) == len(plinko.control_frames)
-    assert all(frame is held.frames[cut - 1] for frame in held.frames[cut:])
     matched = arms.ARMS["length_matched"].film(plinko)
     assert len(matched.frames) == cut
     assert plinko.spec.closes_frame == 45

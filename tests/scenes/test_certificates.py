@@ -39,7 +39,7 @@ from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene
 from traps_pipeline.scenes.worlds.spec import SceneSpec, trajectory_digest
 
 
-# `traps certify` looks at all 702.
+# `traps benchmark certify` looks at all 702.
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", first_of_each("occluder", of=lambda family: family.category))
 def test_a_scenario_of_every_occlusion_category_is_certified(scenario_id: str) -> None:

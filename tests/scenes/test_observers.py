@@ -10,7 +10,6 @@ from tests.scenes.observed import frozen, observed
 from tests.scenes.released import SAMPLED, Released, first_of_each, load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.observe import family_asking
-from traps_pipeline.scenes.parts.offers import without_choices
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask
 from traps_pipeline.scenes.parts.wording import asked
 from traps_pipeline.scenes.physics.kit import COLOURS
@@ -75,29 +74,16 @@ def test_the_observer_answers_from_the_end_alone_where_a_panel_hid_the_beginning
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["head_on-0001", "plinko-0001", "spinner-0001", "target_land-0001"])
-def test_the_observer_answers_a_question_without_choices_by_sight(scenario_id: str) -> None:
-    case = load(scenario_id)
-    plain, observe = without_choices(case.spec.question, tuple(case.spec.labels)), case.family.observe
-    assert plain is not None and observe is not None
-    assert family_asking(plain) is case.family
-    assert observe(case.control_frames, plain) == case.spec.ground_truth
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", ["pachinko_waterfall-0001", "seesaw_sorter-0001"])
-def test_the_observer_foretells_a_cut_that_is_predictable_and_abstains_on_the_held_void(scenario_id: str) -> None:
+def test_the_observer_foretells_a_cut_that_is_predictable(scenario_id: str) -> None:
     said, answer = _reads("predictable_cut", scenario_id)
     assert said == answer
-    said, _ = _reads("held_void", scenario_id)
-    assert said is None
 
 
 @pytest.mark.slow
 def test_the_observer_does_not_foretell_a_die_whose_slow_tumbling_tells_nothing() -> None:
-    """A face that a slowed die shows was wrong twice as often as right, and some held voids have one."""
+    """A face that a slowed die shows was wrong twice as often as right."""
     assert _reads("predictable_cut", "tumbling_dice-0001")[0] is None
-    assert _reads("held_void", "tumbling_dice-0066")[0] is None
 
 
 def _with_panel_elsewhere(case: Released, frames: np.ndarray) -> np.ndarray:
@@ -135,8 +121,7 @@ def test_a_question_gives_its_template_and_values_back() -> None:
     templates = ("Does the {ball} ball pass the {line} line, yes or no?", "Where is the {ball} ball: left or right?")
     assert asked(templates, "Does the red ball pass the blue line, yes or no?") == {"ball": "red", "line": "blue"}
     assert asked(templates, "Where is the red ball: left or right?") == {"ball": "red"}
-    assert asked(templates, "Where is the red ball?") == {"ball": "red"}  # the arm choices_swapped asks so
-    assert asked(("Which of {x} is first: {choices}?",), "Which of us is first?") == {"x": "us"}
+    assert asked(templates, "Where is the red ball?") is None
     assert asked(("Which ball is first: {choices}?",), "Which ball is first: red or blue?") == {
         "choices": "red or blue"
     }

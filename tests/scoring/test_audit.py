@@ -95,7 +95,7 @@ def test_two_printed_transfer_types_contradict_the_definitions(findings):
 
 
 def test_the_command_prints_claims_and_discrepancies_and_writes_all_findings(tmp_path, capsys):
-    assert main(["audit", "--csv", str(tmp_path / "audit.csv")]) == 0
+    assert main(["results", "audit", "--csv", str(tmp_path / "audit.csv")]) == 0
     printed = capsys.readouterr().out
     assert "agrees          steer-family" in printed
     assert "differs         nine-contour" in printed and "(line 1907)" in printed

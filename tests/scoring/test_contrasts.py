@@ -382,7 +382,7 @@ def test_the_command_compares_what_both_benchmarks_still_hold(rows, tmp_path, ca
         workspace.tables.write(VERDICTS, cell.partition, verdicts, {})
         studies.append(str(workspace.root))
     then, now = studies
-    assert main(["compare", then, "--workspace", now, "--csv", str(tmp_path / "out.csv")]) == 0
+    assert main(["results", "compare", then, "--workspace", now, "--csv", str(tmp_path / "out.csv")]) == 0
     written = pd.read_csv(tmp_path / "out.csv")
     assert written["n_pairs"].tolist() == [3, 3]
     assert written["difference"].tolist() == [0, 0]

@@ -1,8 +1,9 @@
-"""PECS-R, the gap and twin accuracy against figures worked out by hand."""
+"""Conjunction, robust figure and inference against figures worked out by hand, and against rules that cannot pass."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from tests.build.verdicts import of_arm, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.pipeline.stages import scoring_stages
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.scoring.bootstrap import intervals, resample
-from traps_pipeline.scoring.robust import robust, wrong_rows
+from traps_pipeline.scoring.metrics import decision_counts
+from traps_pipeline.scoring.robust import conjunction_of, robust, wrong_rows
 from traps_pipeline.scoring.score_rows import ROBUST
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.study import Study
@@ -48,42 +49,114 @@ def only(table: pd.DataFrame) -> Any:
     return table.iloc[0]
 
 
-def test_kinds_have_equal_weight_however_many_items_they_have(rows: Rows) -> None:
-    # Pairs: Acc 1, FalseAbs 0, AbsRec 1, PECS 1. Decoys: Acc 0, FalseAbs 1. Held voids: AbsRec 0.
-    # Acc-R = (1 + 0) / 2, FalseAbs-R = (0 + 1) / 2, AbsRec-R = (1 + 0) / 2, so that J-R = 0 and PECS-R = 0.
-    arms = {"decoy": [SHY] * 3, "held_void": [BOLD] * 2}
-    row = only(robust(study(rows, [RIGHT] * 50, arms), 20))
-    assert (row.acc_r, row.false_abs_r, row.abs_rec_r, row.pecs_r) == (0.5, 0.5, 0.5, 0.0)
-    assert (row.pecs, row.gap) == (1.0, 1.0)
-    assert row.arms == ["decoy", "held_void"]
-    assert (row.n_runs, row.n_items, row.n_missing) == (1, 4 * 100 + 3 + 2, 0)
+# --- conjunction ------------------------------------------------------------------------------------------------------
+
+CLIPS, QUESTIONS = ("control", "twin", "void"), ("own", "aside", "foreign")
+ASKED = {  # dataset and side of a decision: the clip and the question that it is on
+    ("occlusion", "control"): ("control", "own"),
+    ("occlusion", "void"): ("void", "own"),
+    ("twin_control", "control"): ("twin", "own"),
+    ("crossed", "control"): ("void", "aside"),
+    ("crossed", "void"): ("control", "foreign"),
+}
 
 
-def test_pecs_r_of_arms_of_one_and_of_two_sides(rows: Rows) -> None:
-    # Decoys: one of four abstained on and wrong. Swapped choices: of two pairs, controls 1/2 right and 0 abstained on,
-    # voids 1/2. Acc-R = (1 + 3/4 + 1/2) / 3 = 3/4, FalseAbs-R = (0 + 1/4 + 0) / 3 = 1/12,
-    # AbsRec-R = (1 + 1/2) / 2 = 3/4, PECS-R = 3/4 x (3/4 - 1/12) = 1/2.
-    arms = {"decoy": [RIGHT] * 3 + [SHY], "choices_swapped": [(True, False, True), (False, False, False)]}
-    row = only(robust(study(rows, [RIGHT] * 4, arms), 20))
-    found = row[["acc_r", "false_abs_r", "abs_rec_r", "pecs_r", "gap"]].to_list()
-    assert found == pytest.approx([3 / 4, 1 / 12, 3 / 4, 1 / 2, 1 / 2])
+def conjunction(abstains: Mapping[tuple[str, str], np.ndarray]) -> np.ndarray:
+    """Return whether all is right (n,), for n models of one scenario: whether each abstains on a clip and question
+    (n,). They answer rightly."""
+    parts = [
+        pd.DataFrame({"dataset": dataset, "side": side, "abstained": abstains[asked]}).rename_axis("scenario_id")
+        for (dataset, side), asked in ASKED.items()
+    ]
+    verdicts = pd.concat(parts).reset_index()
+    verdicts["correct"] = (~verdicts["abstained"]).where(verdicts["side"] == "control")
+    about = verdicts[["scenario_id", "dataset", "side"]]
+    return conjunction_of(pd.concat([about, decision_counts(verdicts)], axis=1)).to_numpy(float)
+
+
+def test_two_classifiers_that_never_meet_pass_no_scenario_however_they_are_joined() -> None:
+    # All of 2^3 decisions by the clip with all of 2^3 by the question; a rule of both that only rises with either.
+    bits = np.array(list(product([False, True], repeat=6)))
+    clip, question = dict(zip(CLIPS, bits.T[:3], strict=True)), dict(zip(QUESTIONS, bits.T[3:], strict=True))
+    joined = {"or": np.logical_or, "and": np.logical_and, "clip": lambda f, g: f, "question": lambda f, g: g}
+    for name, join in joined.items():
+        decisions = {(c, q): join(clip[c], question[q]) for c, q in ASKED.values()}
+        assert not conjunction(decisions).any(), name
+    related = {(c, q): np.logical_xor(clip[c], question[q]) for c, q in ASKED.values()}
+    assert conjunction(related).any()  # what relates clip and question can pass
+
+
+def test_added_evidence_passes_one_of_two_partners_at_most() -> None:
+    # The foreign question of each is the own question of the other: evidence of one text serves both.
+    rng = np.random.default_rng(0)
+    clips = {(s, c): rng.normal(size=20_000) for s in range(2) for c in CLIPS}
+    own = {(s, q): rng.normal(size=20_000) for s in range(2) for q in ("own", "aside")}
+    passed = []
+    for s in range(2):
+        questions = {"own": own[s, "own"], "aside": own[s, "aside"], "foreign": own[1 - s, "own"]}
+        passed.append(conjunction({(c, q): clips[s, c] + questions[q] > 0 for c, q in ASKED.values()}) == 1)
+    assert passed[0].any() and passed[1].any()
+    assert not (passed[0] & passed[1]).any()
+
+
+def test_the_conjunction_is_the_share_of_scenarios_with_all_right(rows: Rows) -> None:
+    # Scenarios 1 to 5 of occlusion: all right; the void answered; the crossed void answered; the twin undecided, all
+    # else right (not decided); the twin undecided and the control wrong. The sixth has no crossed questions.
+    pairs = [RIGHT, BOLD, RIGHT, RIGHT, (False, False, True), RIGHT]
+    twins = [RIGHT, RIGHT, RIGHT, (None, None, None), (None, None, None), RIGHT]
+    crossed = [RIGHT, RIGHT, BOLD, RIGHT, RIGHT]
+    row = only(robust(study(rows, pairs, {"twin_control": twins, "crossed": crossed}), 200))
+    assert (row.conjunction, row.n_conjunction) == (1 / 4, 4)
+    assert row.conjunction_ci_low < 0.02 < 1 / 4 < row.conjunction_ci_high
+    # One right of four; nobody is seen who is like the unseen: the interval of Clopper and Pearson is [0.006, 0.806].
+    assert (row.conjunction_ci_low, row.conjunction_ci_high) == pytest.approx((0.006, 0.806), abs=0.09)
+    without = only(robust(study(rows, pairs, {"crossed": crossed}), 20))
+    assert np.isnan(without.conjunction) and without.n_conjunction == 0
+
+
+# --- robust and inference ---------------------------------------------------------------------------------------------
+
+
+def test_a_kind_weighs_as_the_pairs_from_thirty_scenarios_on(rows: Rows) -> None:
+    # Pairs: Acc 1, FalseAbs 0, AbsRec 1. Decoys, abstained on: Acc 0, FalseAbs 1, of weight 1.
+    # Acc = (1 + 0) / 2, FalseAbs = (0 + 1) / 2, AbsRec = 1: 1/2 x (1 - 1/2) = 1/4.
+    row = only(robust(study(rows, [RIGHT] * 40, {"decoy": [SHY] * 30}), 20))
+    assert row.robust == pytest.approx(1 / 4)
+    assert (row.arms, row.n_runs, row.n_items, row.n_missing) == (["decoy"], 1, 4 * 80 + 30, 0)
+
+
+def test_a_kind_of_few_scenarios_weighs_less(rows: Rows) -> None:
+    # Three decoys weigh 1/10, five crossed scenarios 1/6: their controls are right, two of their five voids answered.
+    # Acc = (1 + 0 + 1/6) / (1 + 1/10 + 1/6) = 35/38, FalseAbs = (1/10) / (38/30) = 3/38,
+    # AbsRec = (1 + 1/6 x 3/5) / (1 + 1/6) = 33/35.
+    arms = {"decoy": [SHY] * 3, "crossed": [RIGHT] * 3 + [BOLD] * 2}
+    row = only(robust(study(rows, [RIGHT] * 8, arms), 20))
+    assert row.robust == pytest.approx(35 / 38 * (33 / 35 - 3 / 38))
+
+
+def test_what_must_be_inferred_enters_neither_figure(rows: Rows) -> None:
+    arms = {"decoy": [RIGHT] * 30, "late_panel": [SHY, SHY, RIGHT], "predictable_cut": [(False, False, None)]}
+    row = only(robust(study(rows, [RIGHT] * 30, arms), 20))
+    assert (row.robust, row.inference_acc, row.inference_abstains) == (1.0, 1 / 4, 1 / 2)
+    alone = only(robust(study(rows, [RIGHT] * 3, {"late_panel": [RIGHT]}), 20))
+    assert np.isnan([alone.robust, alone.robust_ci_low, alone.conjunction]).all() and alone.inference_acc == 1.0
 
 
 def test_figures_are_computed_per_run_and_then_averaged(rows: Rows) -> None:
-    # Run 1: decoys right, PECS-R 1. Run 2: decoys abstained on: Acc-R 1/2, J-R 1 - 1/2, PECS-R 1/4.
-    runs = [study(rows, [RIGHT] * 2, {"decoy": [said] * 2}, run=run) for run, said in ((1, RIGHT), (2, SHY))]
+    # Run 1: decoys right, 1. Run 2: decoys abstained on, 1/4. Their mean is 5/8; no pooled run has it.
+    runs = [study(rows, [RIGHT] * 30, {"decoy": [said] * 30}, run=run) for run, said in ((1, RIGHT), (2, SHY))]
     row = only(robust(pd.concat(runs, ignore_index=True), 20))
-    assert (row.n_runs, row.pecs_r, row.pecs_r_std, row.gap) == (2, 0.625, 0.375, 0.375)
+    assert (row.n_runs, row.robust) == (2, pytest.approx(0.625))
 
 
 def test_an_entry_rests_on_the_runs_that_have_most_arms(rows: Rows) -> None:
-    # Run 1 alone has the held voids, run 3 no arm, run 4 lacks a dataset.
-    one = study(rows, [RIGHT], {"decoy": [RIGHT], "held_void": [RIGHT]}, run=1)
+    # Run 1 alone has the twins, run 3 no arm, run 4 lacks a dataset.
+    one = study(rows, [RIGHT], {"decoy": [RIGHT], "twin_control": [RIGHT]}, run=1)
     others = [study(rows, [BOLD], {"decoy": [SHY]}, run=2), study(rows, [BOLD], {}, run=3)]
-    partial = study(rows, [BOLD], {"decoy": [SHY], "held_void": [BOLD]}, run=4)
+    partial = study(rows, [BOLD], {"decoy": [SHY], "twin_control": [BOLD]}, run=4)
     partial = partial.loc[partial["dataset"] != "chaotic"]
     row = only(robust(pd.concat([one, *others, partial], ignore_index=True), 20))
-    assert (row.arms, row.n_runs, row.pecs, row.pecs_r) == (["decoy", "held_void"], 1, 1.0, 1.0)
+    assert (row.arms, row.n_runs, row.robust) == (["decoy", "twin_control"], 1, 1.0)
 
 
 def test_a_model_without_arms_or_without_all_datasets_has_no_row(rows: Rows) -> None:
@@ -95,67 +168,31 @@ def test_a_model_without_arms_or_without_all_datasets_has_no_row(rows: Rows) -> 
     assert robust(without, 20).empty
 
 
-def test_twin_accuracy_is_the_share_of_scenarios_with_both_worlds_right(rows: Rows) -> None:
-    # Controls of five scenarios: right, right, wrong, right, right. Their twins: right, wrong, right, undecided; the
-    # fifth has none. Both are decided of three scenarios, and right of one.
-    own = [(True, False, True)] * 2 + [(False, False, True)] + [(True, False, True)] * 2
-    twins = [(True, False, None), (False, False, None), (True, False, None), (None, None, None)]
-    row = only(robust(study(rows, own, {"twin_control": twins}), 20))
-    assert (row.twin_accuracy, row.n_twins, row.n_missing) == (pytest.approx(1 / 3), 3, 1)
-    assert row.twin_accuracy_std == 0  # of one run
-    other = only(robust(study(rows, own, {"decoy": own}), 20))
-    assert (other.twin_accuracy, other.n_twins) == (None, 0)
-
-
 def test_a_figure_without_a_decided_item_is_null(rows: Rows, tmp_path: Path) -> None:
-    table = robust(study(rows, [RIGHT], {"held_void": [(True, False, None)]}), 20)
+    table = robust(study(rows, [RIGHT], {"crossed": [(True, False, None)]}), 20)
     row = only(table)
-    assert np.isnan([row.abs_rec_r, row.pecs_r, row.gap, row.pecs_r_ci_low]).all()
-    assert (row.acc_r, row.pecs, row.n_missing) == (1.0, 1.0, 1)
+    assert np.isnan([row.robust, row.robust_ci_low]).all()
+    assert row.n_missing == 1
     TableStore(tmp_path).write(ROBUST, {}, table, {})
 
 
-def test_the_interval_of_pecs_r_is_that_of_pecs_where_the_arm_repeats_the_pairs(rows: Rows) -> None:
-    # All controls are right and none abstained on, so that both are means of AbsRec: over the four datasets, and over
-    # these and the arm. The arm's voids are the scenarios of occlusion; scenarios are drawn as for PECS.
-    pairs = [(True, False, k % 3 > 0) for k in range(30)]
-    verdicts = study(rows, pairs, {"held_void": pairs})
-    row = only(robust(verdicts, 300))
-    board = intervals(resample(verdicts.loc[verdicts["dataset"].isin(DATASETS)], 300)).set_index("dataset")
-    overall = board.loc["overall", "pecs_ci_high"] - board.loc["overall", "pecs_ci_low"]
-    assert row.pecs_r == pytest.approx(2 / 3) and row.pecs_r_ci_low < 2 / 3 < row.pecs_r_ci_high
-    assert row.pecs_r_ci_high - row.pecs_r_ci_low == pytest.approx(overall, rel=0.25)
-    assert row.gap == pytest.approx(0.0) and row.gap_ci_low < 0 < row.gap_ci_high
-    assert list(board.index) == [*DATASETS, "overall"]
-
-
 def test_a_scenarios_items_in_pairs_and_arm_are_drawn_together(rows: Rows) -> None:
-    # The arm's voids are abstained on where those of the occlusion pairs are not, so that their sum never varies.
-    even, odd = ([(True, False, k % 2 == rest) for k in range(20)] for rest in (0, 1))
-    parts = {"occlusion": even, "occlusion_ill_posed": even, "chaotic": [RIGHT] * 20, "chaotic_ill_posed": [RIGHT] * 20}
-    verdicts = pd.concat([cells(rows, d, p) for d, p in {**parts, "held_void": odd}.items()], ignore_index=True)
-    opposite = only(robust(verdicts, 400))
-    alike = pd.concat([cells(rows, d, p) for d, p in {**parts, "held_void": even}.items()], ignore_index=True)
-    same = only(robust(alike, 400))
-    # With the share s of even scenarios AbsRec-R is 3/4 - s/4, of which s cancels in part, against 1/4 + 3s/4.
-    assert opposite.pecs_r_ci_high - opposite.pecs_r_ci_low < 0.8 * (same.pecs_r_ci_high - same.pecs_r_ci_low)
+    # Decoys are answered rightly where the occlusion controls are not, and the reverse: their mean never varies, so the
+    # interval is narrower than with decoys that agree with the pairs.
+    even, odd = ([(k % 2 == rest, False, True) for k in range(60)] for rest in (0, 1))
+    parts = {"occlusion": even, "occlusion_ill_posed": even, "chaotic": [RIGHT] * 60, "chaotic_ill_posed": [RIGHT] * 60}
+    pairs = [cells(rows, name, of) for name, of in parts.items()]
+    against, alike = (only(robust(pd.concat([*pairs, cells(rows, "decoy", of)]), 300)) for of in (odd, even))
+    width = {name: row.robust_ci_high - row.robust_ci_low for name, row in (("against", against), ("alike", alike))}
+    assert against.robust == alike.robust == pytest.approx(5 / 8)
+    assert width["against"] < 0.8 * width["alike"]
 
 
-def test_an_arm_of_both_taxonomies_is_one_kind_over_all_its_items(rows: Rows) -> None:
-    # Swapped choices of one occlusion scenario (all right) and of three chaotic ones (abstained on): Acc 1/4.
-    swapped = [
-        cells(rows, "choices_swapped", [RIGHT]),
-        cells(rows, "chaotic", [SHY] * 3).assign(dataset="choices_swapped"),
-    ]
-    row = only(robust(pd.concat([study(rows, [RIGHT] * 3, {}), *swapped], ignore_index=True), 20))
-    assert (row.acc_r, row.false_abs_r, row.abs_rec_r) == ((1 + 1 / 4) / 2, (0 + 3 / 4) / 2, 1.0)
-
-
-def test_pairs_and_arms_of_different_campaigns_make_no_gap(rows: Rows, tmp_path: Path) -> None:
+def test_pairs_and_arms_of_different_campaigns_are_not_joined(rows: Rows, tmp_path: Path) -> None:
     verdicts = pd.concat([study(rows, [RIGHT], {}), cells(rows, "decoy", [RIGHT], epoch="e2")], ignore_index=True)
     table = robust(verdicts, 20)
     row = only(table)
-    assert (row.pecs_r, row.gap, row.epoch) == (1.0, None, "e1+e2")
+    assert (row.robust, row.conjunction, row.epoch) == (None, None, "e1+e2")
     assert "pairs of epoch e1, arms of epoch e2" in row.refused
     TableStore(tmp_path).write(ROBUST, {}, table, {})
 

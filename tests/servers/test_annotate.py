@@ -29,7 +29,7 @@ def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
     workspace = labelled_study(tmp_path / "study", TEXTS)
     annotation, file = Annotation(workspace), tmp_path / "labels.csv"
     at = ("--workspace", str(workspace.root))
-    assert main(["confabulation", "labels", str(file), *at]) == 1
+    assert main(["people", "labels", str(file), *at]) == 1
     assert "no failure is labelled by everybody yet" in capsys.readouterr().err
     seen = set()
     for who in ("ann", "bob"):
@@ -44,10 +44,10 @@ def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
     assert annotation.progress("bob", "confabulation") == (3, 3)
     assert "You have labelled all 3" in annotation.unit_page("bob", "confabulation")
     assert "There is nothing to label here" in annotation.unit_page("bob", "answerability")  # its clips are not there
-    assert main(["confabulation", "labels", str(file), *at]) == 0
+    assert main(["people", "labels", str(file), *at]) == 0
     assert "6 labels of ann, bob" in capsys.readouterr().out
     assert {row["invalid_inference"] for row in csv.DictReader(file.open())} == {"0"}
-    assert main(["confabulation", "validate", str(file), *at]) == 0
+    assert main(["people", "validate", str(file), *at]) == 0
     assert workspace.tables.read(JUDGE_VALIDATION, {})["accuracy"].tolist() == [1.0] * 5
 
 
@@ -60,7 +60,7 @@ def test_each_person_has_an_address_of_their_own_that_stays(tmp_path: Path) -> N
     tokens = personal_tokens("one secret of sixteen", ["jd", "ab"])
     assert set(tokens) < set(personal_tokens("one secret of sixteen", ["ab", "cy", "jd"]))
     assert not set(tokens) & set(personal_tokens("another secret, sixteen", ["jd", "ab"]))
-    behind = Listening("127.0.0.1", 3200, tokens, "traps annotate", "https://labels.example.org/")
+    behind = Listening("127.0.0.1", 3200, tokens, "traps people annotate", "https://labels.example.org/")
     assert {who: address.partition("=")[0] for who, address in behind.addresses().items()} == {
         "jd": "https://labels.example.org/?token",
         "ab": "https://labels.example.org/?token",

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.cli import main
-from traps_pipeline.cli.command import OK, Commands, Run, whole
+from traps_pipeline.cli.command import OK, Commands, Parser, Run, whole
 
 if TYPE_CHECKING:
     from tools.pocket.recipe import Recipe
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """Return the parser of `render`, `train`, `evaluate` and `card`."""
-    parser = argparse.ArgumentParser(prog="python -m tools.pocket", description="the small model that is trained here")
-    commands = Commands(parser, title="commands")
+    parser = Parser(prog="python -m tools.pocket", description="the small model that is trained here")
+    commands = Commands(parser)
     text = "draw the scenes that the pocket model is trained and tested on; continues where it was stopped"
     command = _add(commands, "render", render, text)
     _add_scenes(command)

@@ -8,7 +8,6 @@ import math
 import re
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -17,6 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.terminal import plain
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -234,8 +234,7 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
         field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")
         if each["type"] == "extra_forbidden":
             known = [] if model is None else _fields_at(model, each["loc"][:-1])
-            similar = get_close_matches(str(each["loc"][-1]), known, 1)
-            message = "there is no such key" + (f"; did you mean {similar[0]}?" if similar else "")
+            message = f"there is no such key{did_you_mean(str(each['loc'][-1]), known)}"
         parts.append(f"{field}: {message}" if field else message)
     return plain("; ".join(parts))[:MOST_SAID]
 

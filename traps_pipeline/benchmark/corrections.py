@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
@@ -227,7 +228,8 @@ def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenari
     if study.scenarios is not None:
         unknown = sorted(set(study.scenarios) - set(scenarios) - _ever_known())
         if unknown:
-            raise TrapsError(f"study.yaml: unknown scenarios {unknown}; `ls scene_specs/released` shows the families")
+            near = did_you_mean(unknown[0], scenarios) or "; `ls scene_specs/released` shows the families"
+            raise TrapsError(f"study.yaml: unknown scenarios {unknown}{near}")
         return {id_: scenarios[id_] for id_ in sorted(study.scenarios) if id_ in scenarios}
     if study.per_family is None:
         return dict(scenarios)

@@ -16,13 +16,14 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
+from traps_pipeline.benchmark.corrections import folded
 from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import CROSSED, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
-from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
+from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -159,12 +160,26 @@ def _files(clip: Path) -> tuple[Path, ...]:
 @cache
 def _code(arm: str) -> str:
     """The code that films an arm or a variation: after a change of it, it is filmed anew."""
-    names = ("variants/arms.py", "parts/offers.py") if arm in ARM_NAMES else ("variants/variations.py",)
-    return digest([file_digest(PACKAGE / "scenes" / name) for name in names])
+    name = "arms.py" if arm in ARM_NAMES else "variations.py"
+    return file_digest(PACKAGE / "scenes" / "variants" / name)
+
+
+def arm_of(spec: SceneSpec, arm: str) -> Arm:
+    """Return the arm or variation of a scenario, which crosses its questions with its partner's in the benchmark."""
+    return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else KNOWN[arm]
+
+
+@cache
+def _partners(family: str) -> dict[str, SceneSpec]:
+    """The partners of a family's scenarios. A scenario whose scene was corrected or added has none."""
+    members = [one for one in folded().values() if one.family == family]
+    specs = {one.scenario_id: one.changed_words() for one in members if one.released and one.params is None}
+    return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
 
 
 def _of(spec: SceneSpec, arm: str) -> str:
-    return digest([spec.spec_hash, arm, _code(arm)])[:24]
+    partner = _partners(spec.family).get(spec.scenario_id) if arm == CROSSED else None
+    return digest([spec.spec_hash, arm, _code(arm), partner and partner.spec_hash])[:24]
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
@@ -179,8 +194,9 @@ def film(job: Job) -> int:
     for arm, clip in job.clips.items():
         of = _of(job.spec, arm)
         try:
-            KNOWN[arm].ask(job.spec)
-            take = KNOWN[arm].film(scenario)
+            known = arm_of(job.spec, arm)
+            known.ask(job.spec)
+            take = known.film(scenario)
             if take.frames:
                 drawn += save_clip(clip, take.frames, scenario.fps)
             finding = Finding(of, None, take.evidence, len(take.frames))
@@ -223,7 +239,7 @@ def _rows(
     if finding.refused is not None:
         yield replace(empty, ground_truth=None)
         return
-    for question in KNOWN[arm].ask(spec):
+    for question in arm_of(spec, arm).ask(spec):
         of_pair = question.clip
         if of_pair is not None:
             shown = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])

@@ -12,7 +12,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
-from traps_pipeline.protocol.datasets import ALL_CATEGORIES, BESIDE, SIDES, all_datasets_of, is_ill_posed
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES, BESIDE, CROSSED, SIDES, all_datasets_of, is_ill_posed
 from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
@@ -90,8 +90,11 @@ def _of_arm(
 
 
 def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
+    words = {"labels": row["labels"]}
+    if row["arm"] == CROSSED:  # a question of its own, whose labels have no other wordings
+        words |= {"aliases": "{}", "answer_type": answer_type_of(row["labels"])}
     decisive: dict[str, Any] = _decisive(
-        {**spec, "labels": row["labels"]},
+        {**spec, **words},
         dataset=row["arm"],
         side=row["side"],
         question=row["question"],
@@ -100,6 +103,14 @@ def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: 
         media_digest=row["media_digest"],
     )
     return _row(decisive, spec, commonest, row["clip"], version)
+
+
+def answer_type_of(labels: Sequence[str]) -> str:
+    """Return the answer type of a question by its labels."""
+    if all(label.isdigit() for label in labels):
+        return "numeric"
+    known = {("left", "right"): "direction", ("no", "yes"): "binary"}
+    return next((kind for choices, kind in known.items() if sorted(labels) == [*choices]), "colour")
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:

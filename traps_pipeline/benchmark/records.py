@@ -45,7 +45,9 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
                 )
             records[spec.scenario_id] = spec
     if not records:
-        raise TrapsError(f"{folder}: holds no released records; restore it from git or draw some with `traps sample`")
+        raise TrapsError(
+            f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"
+        )
     return records
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import repeat
 from threading import Thread
@@ -30,11 +29,12 @@ class _Loopback(Account):
         return PLACEHOLDER_KEY
 
 
-@dataclass
 class _Notes(Progress):
     """Keeps the notes of a backend, such as the reason why a client library refused to send."""
 
-    texts: list[str] = field(default_factory=list)
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts = list[str]()
 
     def note(self, text: str) -> None:
         """See `Progress.note`."""

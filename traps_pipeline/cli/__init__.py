@@ -20,6 +20,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
     annotate,
     benchmark,
+    completion,
     confabulation,
     doctor,
     exchange,
@@ -37,9 +38,30 @@ from traps_pipeline.cli import (
     submission,
     ui,
 )
-from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+GROUPS = {
+    "study": "plan, run and look after a study",
+    "results": "explore, export, compare and audit results",
+    "benchmark": "sample, certify and commit to a benchmark",
+    "models": "check models, judges and panels",
+    "people": "review scenarios, label clips and answers",
+    "publish": "write and verify releases and submissions",
+}
+START = """TRAPSBench: do vision-language models know when not to answer?
+
+  traps doctor                  check this machine
+  traps run demo                evaluate reference models; needs no key
+  traps plan mine.yaml          count calls and dollars of your own experiment; nothing is sent
+  traps status                  say what is not fresh, and how to mend it
+  traps why ITEM                show an item with its answers and votes
+  traps site                    write the explorer of all answers and clips
+
+{groups}
+
+A group lists its commands, and `--help` behind a command shows an example. `traps completion bash` prints what a shell
+needs to complete them."""
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
@@ -116,31 +138,51 @@ def _raise_interrupt(*_: object) -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The command line; `traps --help` lists the commands in this order."""
-    parser = argparse.ArgumentParser(
-        prog="traps", description="TRAPSBench: do vision-language models know when not to answer?"
+def build_parser() -> Parser:
+    """Return the parser of the command line."""
+    parser = Parser(
+        prog="traps",
+        description="TRAPSBench: do vision-language models know when not to answer?",
+        epilog=f"without their group: traps {', '.join(SHORT)}",
+        short=SHORT,
     )
-    commands = Commands(parser, title="commands")
-    for noun in (
+    parser.set_defaults(command=_show_start, parser=parser)
+    parser.add_argument(
+        "--version", dest="command", action="store_const", const=_show_version, help="print the version"
+    )
+    commands = Commands(parser, GROUPS)
+    for module in (
         doctor,
         init,
         plan,
         run,
         status,
         ui,
-        results,
-        release,
-        submission,
-        site,
-        review,
-        annotate,
         exchange,
         ledger,
+        site,
+        results,
+        benchmark,
         models,
         judges,
+        review,
+        annotate,
         confabulation,
-        benchmark,
+        release,
+        submission,
+        completion,
     ):
-        noun.add(commands)
+        module.add(commands)
     return parser
+
+
+def _show_start(_: argparse.Namespace) -> int:
+    print(START.format(groups="\n".join(f"  traps {name:<24}{text}" for name, text in GROUPS.items())))
+    return OK
+
+
+def _show_version(_: argparse.Namespace) -> int:
+    from importlib.metadata import version
+
+    print(f"traps {version('traps-pipeline')}")
+    return OK

@@ -1,4 +1,4 @@
-"""`traps annotate`: pages on which people label clips and answers, without knowing whose they are."""
+"""`traps people annotate`: pages on which people label clips and answers, without knowing whose they are."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ TOKEN_VARIABLE = "TRAPS_ANNOTATE_TOKEN"
 
 
 def add(commands: Commands) -> None:
-    """Add `traps annotate`."""
+    """Add `traps people annotate`."""
     parser = commands.add(
-        "annotate", annotate, "pages on which people label clips and answers blindly; prints an address for each"
+        "people annotate",
+        annotate,
+        "serve pages on which people label clips and answers blindly; print an address for each",
+        example="--who jd ab",
     )
     user = os.environ.get("USER", "")
     parser.add_argument(
@@ -26,7 +29,7 @@ def add(commands: Commands) -> None:
 
 
 def annotate(arguments: argparse.Namespace) -> int:
-    """See `traps annotate --help`."""
+    """See `traps people annotate --help`."""
     require("web")
     from traps_pipeline.servers.annotate import Annotation, annotation_app
     from traps_pipeline.servers.server import serve
@@ -39,7 +42,7 @@ def annotate(arguments: argparse.Namespace) -> int:
             "`@`, e.g. --who jd ab"
         )
     listening = listening_of(
-        arguments, "annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
+        arguments, "people annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
     )
     workspace = open_workspace(arguments)
     if workspace.is_shared:

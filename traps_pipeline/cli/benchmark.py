@@ -1,4 +1,4 @@
-"""`traps certify` and `traps sample`: the benchmark's certificates, and fresh samples of the benchmark."""
+"""`traps benchmark certify` and `sample`: the benchmark's certificates, and fresh samples of the benchmark."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import FAILED, OK, Commands, number, whole
+from traps_pipeline.cli.command import FAILED, OK, Commands, number, print_json, whole
 
 LOOKS = (
     "floor",
@@ -22,9 +22,9 @@ LOOKS = (
 
 
 def add(commands: Commands) -> None:
-    """Add `traps certify` and `traps sample`."""
+    """Add `traps benchmark certify` and `traps benchmark sample`."""
     text = "compute every certificate of the released records again"
-    parser = commands.add("certify", certify, text, workspace=False)
+    parser = commands.add("benchmark certify", certify, text, example="--families plinko", workspace=False, json=True)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
     parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
@@ -33,7 +33,9 @@ def add(commands: Commands) -> None:
     )
 
     text = "sample a fresh benchmark, certified like the released one"
-    parser = commands.add("sample", sample, text, workspace=False)
+    parser = commands.add(
+        "benchmark sample", sample, text, example="--seed 7 --out private --scale 0.1", workspace=False
+    )
     parser.add_argument(
         "--seed", type=whole(0, 2**63 - 1), required=True, help="the same seed gives the same scenarios"
     )
@@ -58,7 +60,7 @@ def add(commands: Commands) -> None:
 
 
 def certify(arguments: argparse.Namespace) -> int:
-    """See `traps certify --help`."""
+    """See `traps benchmark certify --help`."""
     from traps_pipeline.base.paths import SCENE_SPECS, WORKSPACES
     from traps_pipeline.benchmark.certify_all import certify_all, family_table
 
@@ -72,6 +74,9 @@ def certify(arguments: argparse.Namespace) -> int:
         fresh=arguments.fresh,
         report=lambda line: print(line, file=sys.stderr, flush=True),
     )
+    if arguments.json:
+        print_json({"verdicts": verdicts, "problems": problems})
+        return FAILED if problems else OK
     print(family_table(folder, verdicts))
     for problem in problems:
         print(f"traps: {problem}", file=sys.stderr)
@@ -81,7 +86,7 @@ def certify(arguments: argparse.Namespace) -> int:
 
 
 def sample(arguments: argparse.Namespace) -> int:
-    """See `traps sample --help`."""
+    """See `traps benchmark sample --help`."""
     from traps_pipeline.base.names import check_name
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
@@ -113,7 +118,7 @@ def sample(arguments: argparse.Namespace) -> int:
     print(f"{sum(wanted.values())} scenarios of {len(wanted)} families in {arguments.out}")
     there = load_release(arguments.out.absolute() / "benchmark.yaml").name
     print(
-        f"next: traps certify --specs {arguments.out}; to run studies on it, TRAPS_SCENE_SPECS={arguments.out} and "
-        f"`benchmark: {there}` in the experiment"
+        f"next: traps benchmark certify --specs {arguments.out}; to run studies on it, "
+        f"TRAPS_SCENE_SPECS={arguments.out} and `benchmark: {there}` in the experiment"
     )
     return OK

@@ -7,10 +7,17 @@ answers at once.
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
 import re
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from traps_pipeline.base.suggestions import did_you_mean, nearest
+from traps_pipeline.base.terminal import plain
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
@@ -20,6 +27,9 @@ if TYPE_CHECKING:
 
 # Exit codes. For bad usage argparse itself exits with 2.
 OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
+METAVAR = "COMMAND"
+# Commands of daily use, which can be given without their group.
+SHORT = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"), "study"), "site": "results"}
 
 Run = Callable[[argparse.Namespace], int]  # a command: it takes its parsed arguments and returns an exit code
 
@@ -46,29 +56,128 @@ def number(above: float, most: float) -> Callable[[str], float]:
     return parse
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser that suggests the nearest word for an unknown one, and knows commands of daily use without their group.
+    `commands` holds the parser of every command below it by its name, such as `study run`. short: the groups of
+    commands that can be given without one."""
+
+    def __init__(self, *, short: Mapping[str, str] | None = None, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: dict[str, Parser] = {}
+        self._short = short or {}
+
+    def options(self) -> list[str]:
+        """Return the options of the command."""
+        return [*dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*", self.format_help()))]
+
+    def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
+        self, args: Iterable[str] | None = None, namespace: Any = None
+    ) -> Any:
+        """See `argparse`. An unknown option is told by the command that it was given to."""
+        words = [*(sys.argv[1:] if args is None else args)]
+        if words and words[0] in self._short:
+            words.insert(0, self._short[words[0]])
+        parsed, rest = self.parse_known_args(words, namespace)
+        if rest:
+            parser: Parser = getattr(parsed, "parser", self)
+            parser.error(f"unrecognized arguments: {plain(' '.join(rest))}{did_you_mean(rest[0], parser.options())}")
+        return parsed
+
+    def error(self, message: str) -> NoReturn:
+        """See `argparse`."""
+        wrong = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
+        if wrong and wrong[1] in (None, METAVAR):
+            own, last = re.findall(r"[\w-]+", wrong[3]), {path.split()[-1]: path for path in self.commands}
+            near = nearest(wrong[2], [*own, *self._short]) or nearest(wrong[2], last)
+            name = f"{self.prog} {near}" if near in own else f"traps {last.get(near or '') or near}"
+            name = f"traps {near}" if near in self._short else name
+            hint = f"; did you mean `{name}`?" if near else f"; `{self.prog} --help` lists them"
+            message = f"unknown command {plain(wrong[2])[:40]!r}{hint}"
+        elif wrong:
+            message += did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3]))
+        super().error(message)
+
+
 class Commands:
-    """The commands of a parser, or those of one noun of it."""
+    """The commands of a parser, some of them in groups."""
 
-    def __init__(self, parser: argparse.ArgumentParser, *, title: str | None = None) -> None:
-        if title:
-            self._parsers = parser.add_subparsers(title=title, required=True, metavar="COMMAND")
-        else:
-            self._parsers = parser.add_subparsers(required=True)
+    def __init__(self, parser: Parser, groups: Mapping[str, str] | None = None) -> None:
+        title = "groups" if groups else "commands"
+        self._parsers = {"": parser.add_subparsers(title=title, required=not groups, metavar=METAVAR)}
+        self._commands = parser.commands
+        for name, text in (groups or {}).items():
+            group = self._parsers[""].add_parser(name, help=text, description=text)
+            group.set_defaults(command=_show_help, parser=group)
+            group.commands = self._commands
+            self._parsers[name] = group.add_subparsers(title="commands", metavar=METAVAR)
 
-    def add(self, name: str, run: Run, text: str, *, workspace: bool = True) -> argparse.ArgumentParser:
-        """Add a command; returns its parser, for further arguments. workspace: whether the command works in a study."""
-        parser = self._parsers.add_parser(name, help=text, description=text)
-        parser.set_defaults(command=run)
+    def add(
+        self,
+        path: str,
+        run: Run,
+        text: str,
+        *,
+        example: str = "",
+        workspace: bool = True,
+        json: bool = False,
+        is_paid: bool = False,
+    ) -> Parser:
+        """Add a command; return its parser, for further arguments.
+
+        path: its name, after that of its group. example: arguments that its help shows. workspace: whether it works in
+        a study. json: whether it can print its result as JSON. is_paid: whether a budget can end it.
+        """
+        group, _, name = path.rpartition(" ")
+        over = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
+        codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {over}{INTERRUPTED} interrupted"
+        shown = (
+            f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
+        )
+        parser = self._parsers[group].add_parser(
+            name, help=text, description=text, epilog=shown + codes, formatter_class=_Help
+        )
+        self._commands[path] = parser
+        parser.set_defaults(command=run, parser=parser)
         if workspace:
             parser.add_argument(
                 "--workspace",
                 help="folder or s3:// address of the study (default: $TRAPS_WORKSPACE, else .workspaces/default)",
             )
+        if json:
+            parser.add_argument("--json", action="store_true", help="print the result as JSON")
         return parser
 
-    def noun(self, name: str, text: str) -> Commands:
-        """Add a noun, which has commands of its own."""
-        return Commands(self._parsers.add_parser(name, help=text, description=text))
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of the example and the exit codes."""
+
+
+def _show_help(arguments: argparse.Namespace) -> int:
+    arguments.parser.print_help()
+    return OK
+
+
+def print_json(value: Any) -> None:
+    """Print a result as JSON. A figure that is missing is null."""
+    print(json.dumps(_as_json(value), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if is_dataclass(value):
+        return {each.name: _as_json(getattr(value, each.name)) for each in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _as_json(each) for key, each in value.items()}
+    if hasattr(value, "to_dict"):  # a frame
+        return _as_json(value.to_dict("records"))
+    if hasattr(value, "item"):  # a number of numpy's
+        return _as_json(value.item())
+    return [_as_json(each) for each in value] if isinstance(value, Iterable) else str(value)
 
 
 def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) -> None:
@@ -128,6 +237,12 @@ def entered(workspace: Workspace) -> Workspace:
 def load_definitions() -> None:
     """Declare the graph, from which staleness is computed, without Dagster."""
     import traps_pipeline.pipeline.stages  # noqa: F401 - its import is what declares the graph
+
+
+def add_experiment(parser: argparse.ArgumentParser, **settings: Any) -> None:
+    """Add the argument that names an experiment."""
+    text = "one of assets/experiments, or the path of a YAML file"
+    parser.add_argument("experiment", **{"help": text, **settings})
 
 
 def add_panel(parser: argparse.ArgumentParser) -> None:

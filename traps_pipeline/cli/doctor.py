@@ -6,12 +6,13 @@ import argparse
 
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.cli.command import FAILED, OK, Commands, place_of
+from traps_pipeline.cli.command import FAILED, OK, Commands, place_of, print_json
 
 
 def add(commands: Commands) -> None:
     """Add `traps doctor`."""
-    parser = commands.add("doctor", doctor, "check this machine: render and encode a frame, and name what is missing")
+    text = "check this machine: render and encode a frame, and name what is missing"
+    parser = commands.add("study doctor", doctor, text, example="--verify", json=True)
     parser.add_argument(
         "--local",
         nargs="*",
@@ -35,23 +36,25 @@ def doctor(arguments: argparse.Namespace) -> int:
     from traps_pipeline.checks.doctor import examine, examine_files, examine_local, examine_unused
 
     if arguments.verify:
-        findings = [*examine_files(place_of(arguments))]
-        for finding in findings:
-            print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
-        return OK if all(finding.ok for finding in findings) else FAILED
-    if arguments.unused is not None:
-        finding = examine_unused(place_of(arguments), is_removed=arguments.unused == "remove")
-        print(f"ok   {finding.what}: {plain(finding.detail)}")
-        return OK
-    local = arguments.local is not None
-    if local:
+        findings, summary = iter(examine_files(place_of(arguments))), ("", "")
+    elif arguments.unused is not None:
+        findings = iter([examine_unused(place_of(arguments), is_removed=arguments.unused == "remove")])
+        summary = "", ""
+    elif arguments.local is not None:
         require("local")
-    who, needs = ("local models", "need") if local else ("the demo", "needs")
+        findings = iter(examine_local(arguments.local))
+        summary = "local models will not run", "this machine has everything that local models need"
+    else:
+        findings = iter(examine(place_of(arguments)))
+        summary = "the demo will not run", "this machine has everything that the demo needs"
+    if arguments.json:
+        checked = [*findings]
+        print_json(checked)
+        return OK if all(finding.ok for finding in checked) else FAILED
     problems = 0
-    for finding in examine_local(arguments.local) if local else examine(place_of(arguments)):
+    for finding in findings:
         print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         problems += not finding.ok
-    print(
-        f"{problems} problem(s); {who} will not run" if problems else f"this machine has everything that {who} {needs}"
-    )
+    if summary[0]:
+        print(f"{problems} problem(s); {summary[0]}" if problems else summary[1])
     return FAILED if problems else OK

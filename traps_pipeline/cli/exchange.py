@@ -1,4 +1,4 @@
-"""`traps requests` and `traps answers`: export of calls that are made elsewhere, and import of their answers."""
+"""`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`: calls that are made elsewhere."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace, whole
+from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, open_workspace, whole
 
 if TYPE_CHECKING:
     from traps_pipeline.exchange.answer_exchange import Imported
 
 
 def add(commands: Commands) -> None:
-    """Add `traps requests export` and `traps answers import`."""
+    """Add the exports and imports."""
     text = "write an experiment's missing calls and their media to a folder"
-    parser = commands.noun("requests", "export calls to be made elsewhere").add("export", export_calls, text)
-    parser.add_argument("experiment")
+    parser = commands.add("study export-requests", export_calls, text, example="demo --out requests")
+    add_experiment(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of requests.jsonl and media/, or of batches/")
     parser.add_argument("--batch", action="store_true", help="write the providers' own batch files, with media inline")
     parser.add_argument(
@@ -26,18 +26,19 @@ def add(commands: Commands) -> None:
         help="with --batch: write media to the folder media/, and refer to it under this address (https, gs, file ...)",
     )  # fmt: skip
 
-    noun = commands.noun("votes", "have judges asked in batches")
-    parser = noun.add("export", export_votes, "write the votes that are missing as the judges' batch files")
-    parser.add_argument("experiment")
+    text = "write the votes that are missing as the judges' batch files"
+    parser = commands.add("study export-votes", export_votes, text, example="paper --out votes")
+    add_experiment(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of batches/")
-    parser = noun.add("import", import_cast, "import a provider's batch of votes into the ledger")
-    parser.add_argument("experiment")
-    parser.add_argument("file", type=Path)
+    text = "import a provider's batch of votes into the ledger"
+    parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl")
+    add_experiment(parser)
+    parser.add_argument("file", type=Path, help="what came back")
 
     text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
-    parser = commands.noun("answers", "import answers from elsewhere").add("import", import_given, text)
-    parser.add_argument("experiment")
-    parser.add_argument("file", type=Path)
+    parser = commands.add("study import-answers", import_given, text, example="demo answers.jsonl --model oracle")
+    add_experiment(parser)
+    parser.add_argument("file", type=Path, help="what came back")
     parser.add_argument("--model", help="who answered, in a file by item (default: the experiment's only model)")
     parser.add_argument("--run", type=whole(1, 1_000), default=1, help="of a file by item (default: 1)")
     parser.add_argument("--key", type=Path, help="of the held-out set whose items a file names")
@@ -47,24 +48,24 @@ def add(commands: Commands) -> None:
 
 
 def export_calls(arguments: argparse.Namespace) -> int:
-    """See `traps requests export --help`."""
+    """See `traps study export-requests --help`."""
     from traps_pipeline.exchange.answer_exchange import REQUESTS, export_request_batches, export_requests
 
     experiment = experiment_of(arguments)
     if arguments.batch:
         workspace, out = open_workspace(arguments), arguments.out.absolute()
         files, count = export_request_batches(workspace, experiment, out, arguments.media_at)
-        return _exported(files, count, f"traps answers import {arguments.experiment}")
+        return _exported(files, count, f"traps study import-answers {arguments.experiment}")
     if arguments.media_at:
         raise TrapsError("--media-at: only batch files refer to media by an address; say --batch, too")
     count = export_requests(open_workspace(arguments), experiment, arguments.out.absolute())
     print(f"{count} requests in {arguments.out / REQUESTS}")
-    print(f"next: have them answered, then traps answers import {arguments.experiment} ANSWERS.jsonl")
+    print(f"next: have them answered, then traps study import-answers {arguments.experiment} ANSWERS.jsonl")
     return OK
 
 
 def import_given(arguments: argparse.Namespace) -> int:
-    """See `traps answers import --help`."""
+    """See `traps study import-answers --help`."""
     from traps_pipeline.benchmark.held_out import held_out_key
     from traps_pipeline.exchange.answer_exchange import Whose, import_answers
 
@@ -75,16 +76,16 @@ def import_given(arguments: argparse.Namespace) -> int:
 
 
 def export_votes(arguments: argparse.Namespace) -> int:
-    """See `traps votes export --help`."""
+    """See `traps study export-votes --help`."""
     from traps_pipeline.exchange.answer_exchange import export_vote_batches
 
     experiment = experiment_of(arguments)
     files, count = export_vote_batches(open_workspace(arguments), experiment, arguments.out.absolute())
-    return _exported(files, count, f"traps votes import {arguments.experiment}")
+    return _exported(files, count, f"traps study import-votes {arguments.experiment}")
 
 
 def import_cast(arguments: argparse.Namespace) -> int:
-    """See `traps votes import --help`."""
+    """See `traps study import-votes --help`."""
     from traps_pipeline.exchange.answer_exchange import import_votes
 
     experiment = experiment_of(arguments)

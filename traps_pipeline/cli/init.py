@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, add_panel, entered, experiment_of, place_of
+from traps_pipeline.cli.command import OK, Commands, add_experiment, add_panel, entered, experiment_of, place_of
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add `traps init`."""
-    parser = commands.add("init", init, "make a workspace for an experiment without running it")
-    parser.add_argument("experiment", nargs="?", default="demo")
+    text = "make a workspace for an experiment without running it"
+    parser = commands.add("study init", init, text, example="demo --workspace .workspaces/demo")
+    add_experiment(parser, nargs="?", default="demo")
     add_panel(parser)
     parser.add_argument(
         "--database",

@@ -1,4 +1,4 @@
-"""`traps ledger`: answers, votes and money, moved as they are, and money given back."""
+"""`traps study export-ledger`, `import-ledger`, `move`, `release-money`: answers, votes and money of a study."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import argparse
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, open_workspace
+from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add `traps ledger export`, `import`, `move` and `release`."""
-    noun = commands.noun("ledger", "where answers, votes and spending are kept")
+    """Add the commands of the ledger."""
     text = "write answers, votes and money to one file, as they are"
-    noun.add("export", export, text).add_argument(
-        "file", type=Path, metavar="FILE", help="to be made, e.g. ledger.sqlite"
-    )
+    parser = commands.add("study export-ledger", export, text, example="ledger.sqlite")
+    parser.add_argument("file", type=Path, metavar="FILE", help="to be made")
     text = "read such a file into a study that has no answers yet: in its folder, or in the database of study.yaml"
-    noun.add("import", import_, text).add_argument("file", type=Path, metavar="FILE")
+    parser = commands.add("study import-ledger", import_, text, example="ledger.sqlite")
+    parser.add_argument("file", type=Path, metavar="FILE", help="of `traps study export-ledger`")
     text = "move the whole study into an object store that several hosts share"
-    address = noun.add("move", move, text)
-    address.add_argument("--store", metavar="ADDRESS", required=True, help="s3://BUCKET/STUDY")
+    parser = commands.add("study move", move, text, example="--store s3://bucket/study")
+    parser.add_argument("--store", metavar="ADDRESS", required=True, help="s3://BUCKET/STUDY")
 
     text = "give back money that is booked for calls that never left; without arguments: list what may be released"
-    parser = noun.add("release", release, text)
+    example = '--participant my-model --all-in-flight --why "the process was killed"'
+    parser = commands.add("study release-money", release, text, example=example, json=True)
     parser.add_argument("--participant", metavar="NAME", help="the model or judge whose money it is")
     amount = parser.add_mutually_exclusive_group()
     amount.add_argument("--usd", type=float, metavar="X", help="so many dollars")
@@ -32,13 +32,16 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    """See `traps ledger release --help`."""
+    """See `traps study release-money --help`."""
     from traps_pipeline.base.terminal import text_table
     from traps_pipeline.models import release as releasing
 
     workspace = open_workspace(arguments)
     if arguments.participant is None:
         rooms = releasing.releasable(workspace)
+        if arguments.json:
+            print_json(rooms)
+            return OK
         rows = [(name, f"{room.in_flight:.4f}", f"{room.failed:.4f}") for name, room in rooms.items()]
         print(text_table(("participant", "in flight ($)", "failed ($)"), rows) if rows else "nothing may be released")
         return OK
@@ -50,16 +53,16 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> int:
-    """See `traps ledger export --help`."""
+    """See `traps study export-ledger --help`."""
     from traps_pipeline.ledger.transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute())
-    print(f"{count} rows are in {arguments.file}; `traps ledger import` reads them into another study")
+    print(f"{count} rows are in {arguments.file}; `traps study import-ledger` reads them into another study")
     return OK
 
 
 def import_(arguments: argparse.Namespace) -> int:
-    """See `traps ledger import --help`."""
+    """See `traps study import-ledger --help`."""
     from traps_pipeline.ledger.transfer import import_ledger
 
     workspace = open_workspace(arguments)
@@ -69,7 +72,7 @@ def import_(arguments: argparse.Namespace) -> int:
 
 
 def move(arguments: argparse.Namespace) -> int:
-    """See `traps ledger move --help`."""
+    """See `traps study move --help`."""
     from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import make_progress
     from traps_pipeline.storage.place import place_of

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import FAILED, OK, Commands, entered, place_of
+from traps_pipeline.cli.command import FAILED, OK, Commands, entered, place_of, print_json
 
 
 def add(commands: Commands) -> None:
     """Add `traps models check`."""
     text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
-    parser = commands.noun("models", "check entries of the registry").add("check", check, text)
+    parser = commands.add("models check", check, text, example="mine.yaml --live", json=True)
     parser.add_argument(
         "names", nargs="*", metavar="MODEL", help="check only these models and judges, or all of an experiment (a path)"
     )
@@ -28,7 +28,11 @@ def check(arguments: argparse.Namespace) -> int:
 
     names = _named(arguments)
     if arguments.live:
-        return _check_live(names)
+        return _check_live(names, is_json=arguments.json)
+    if arguments.json:
+        everything = [*check_named(names)]
+        print_json([{"id": one.entry.id, "sent": one.line, "problems": one.problems} for one in everything])
+        return FAILED if any(one.problems for one in everything) else OK
     wrong = 0
     for checked in check_named(names):
         print("\n    ".join([checked.line, *checked.problems]), flush=True)
@@ -58,7 +62,7 @@ def _named(arguments: argparse.Namespace) -> list[str]:
     return names
 
 
-def _check_live(names: list[str]) -> int:
+def _check_live(names: list[str], *, is_json: bool) -> int:
     from traps_pipeline.checks.live_check import check_live
     from traps_pipeline.checks.wire_check import participants
     from traps_pipeline.models.registry import NETWORK
@@ -70,6 +74,8 @@ def _check_live(names: list[str]) -> int:
     if not entries:
         raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
     found = check_live(entries)
-    for one in found:
+    if is_json:
+        print_json(found)
+    for one in () if is_json else found:
         print(one.line, flush=True)
     return FAILED if any(one.problems for one in found) else OK

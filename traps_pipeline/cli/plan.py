@@ -7,31 +7,38 @@ from collections.abc import Mapping, Sequence
 from math import comb
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.cli.command import (
     OK,
     Commands,
+    add_experiment,
     add_panel,
     experiment_of,
     load_definitions,
     open_workspace,
     place_of,
+    print_json,
 )
 
 if TYPE_CHECKING:
+    from traps_pipeline.mechanism.cost import Cost
     from traps_pipeline.models.forecast import Forecast
     from traps_pipeline.pipeline.forecast_plan import Count
 
 
 def add(commands: Commands) -> None:
     """Add `traps plan`."""
-    parser = commands.add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent")
-    parser.add_argument("experiment")
+    text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
+    parser = commands.add("study plan", plan, text, example="demo", json=True)
+    add_experiment(parser)
+    parser.add_argument("--card", default="H100", help="GPU whose hours are given: H100 (default), A100, L40S, RTX4090")
     add_panel(parser)
 
 
 def plan(arguments: argparse.Namespace) -> int:
     """See `traps plan --help`."""
+    from traps_pipeline.mechanism.cost import CARDS
     from traps_pipeline.pipeline.forecast_plan import Count, make_plan
     from traps_pipeline.storage.workspace import Workspace
 
@@ -41,7 +48,12 @@ def plan(arguments: argparse.Namespace) -> int:
     study = experiment.judged(
         workspace.study if workspace else None, arguments.panel, judged_by_rules=arguments.judged_by_rules
     )
-    planned = make_plan(workspace, experiment, study)
+    if arguments.card not in CARDS:
+        raise TrapsError(f"--card {arguments.card}: name one of {', '.join(CARDS)}")
+    planned = make_plan(workspace, experiment, study, arguments.card)
+    if arguments.json:
+        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
+        return OK
     total = (Count(), Count())
     print(f"{experiment.name} in {place if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
@@ -54,6 +66,8 @@ def plan(arguments: argparse.Namespace) -> int:
     print(text_table(headings, [_plan_row(name, counts) for name, counts in [*rows.items(), ("all", total)]]))
     if planned.forecasts:
         _print_forecasts(planned.forecasts, planned.minutes)
+    if planned.local:
+        _print_local(planned.local, arguments.card)
     _print_precision(planned.pairs, len(planned.calls))
     if planned.uncertain:
         print(
@@ -109,10 +123,25 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     print(f"\n{text_table(headings, rows)}")
     in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if in_batches < total[1]:
-        print(f"expected if all calls are made in batches (traps requests export --batch): USD {in_batches:,.2f}")
+        print(f"expected if all calls are made in batches (traps study export-requests --batch): USD {in_batches:,.2f}")
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(f"price unknown, not in the sum: {unknown}")
+
+
+def _print_local(costs: Sequence[Cost], card: str) -> None:
+    """Print passes, tokens, hours of a card and memory of local models; the sum leaves out models without a size."""
+    rows = [
+        (
+            cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",
+            *("unknown" if figure is None else f"{figure:,.1f}" for figure in (cost.hours, cost.gigabytes)),
+        )
+        for cost in costs
+    ]  # fmt: skip
+    hours = sum(cost.hours or 0.0 for cost in costs)
+    rows.append(("all", "", f"{sum(cost.passes for cost in costs):,}", "", f"{hours:,.1f}", ""))
+    print(f"\n{text_table(('on this machine', 'work', 'new', 'M tokens in, out', f'{card} hours', 'GB'), rows)}")
+    print("hours and GB are arithmetic, not measured: docs/mechanism.md#cost")
 
 
 def _dollars(amounts: tuple[float, float, float] | None) -> list[str]:

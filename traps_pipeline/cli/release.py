@@ -1,4 +1,4 @@
-"""`traps release`, `verify`, `commit`, `verify-commitment`: the folder that is published, and what proves it."""
+"""`traps publish release`, `verify`, `harness` and `traps benchmark commit`, `prove`: what is published, and proofs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
+from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace, print_json, whole
 from traps_pipeline.cli.submission import verify_file
 
 if TYPE_CHECKING:
@@ -18,27 +18,31 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add the commands of releases."""
     text = "write the folder that is published: clips, questions, labels, certificates, card, checksums"
-    parser = commands.add("release", release, text)
-    parser.add_argument("folder", type=Path)
+    parser = commands.add("publish release", release, text, example="out --anonymous")
+    parser.add_argument("folder", type=Path, help="an empty or new one")
     parser.add_argument("--arms", nargs="+", default=[], metavar="ARM", help="also the items and clips of these arms")
     parser.add_argument("--anonymous", action="store_true", help="name no author, for double-blind review")
     parser.add_argument(
         "--without-answers", type=Path, metavar="KEY",
         help="a held-out set: items under opaque names, which only this file tells (it is made where it is missing)",
     )  # fmt: skip
-    parser.add_argument("--commitment", type=Path, metavar="FILE", help="publish a file of `traps commit` with it")
+    parser.add_argument(
+        "--commitment", type=Path, metavar="FILE", help="publish a file of `traps benchmark commit` with it"
+    )
     parser.add_argument("--date", metavar="YYYY-MM-DD", help="of the publication, for the descriptions")
     parser.add_argument("--sign", type=Path, metavar="PEM", help="sign it with this private elliptic key")
 
     text = "name what was altered in a release, or what does not hold in a submission"
-    parser = commands.add("verify", verify, text, workspace=False)
-    parser.add_argument("path", type=Path, help="a folder of `traps release`, or a file of `traps submit`")
+    parser = commands.add("publish verify", verify, text, example="out", workspace=False, json=True)
+    parser.add_argument(
+        "path", type=Path, help="a folder of `traps publish release`, or a file of `traps publish submit`"
+    )
     parser.add_argument("--key", type=Path, metavar="PEM", help="of a release: check its signature, too")
     parser.add_argument("--release", type=Path, metavar="FOLDER", help="of a submission: hold its items against this")
 
     text = "write the folder with which inspect_ai and lmms-eval evaluate models on a release"
-    parser = commands.add("harness", harness, text, workspace=False)
-    parser.add_argument("release", type=Path, help="a folder that `traps release` wrote")
+    parser = commands.add("publish harness", harness, text, example="out harness", workspace=False)
+    parser.add_argument("release", type=Path, help="a folder that `traps publish release` wrote")
     parser.add_argument("folder", type=Path, help="an empty or new one")
     parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
     parser.add_argument(
@@ -47,22 +51,24 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
-    parser = commands.add("commit", commit_benchmark, text, workspace=False)
-    parser.add_argument("benchmark", type=Path, help="a folder that `traps sample` wrote")
+    example = "private --out commitment.json --reveal reveal.json"
+    parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
+    parser.add_argument("benchmark", type=Path, help="a folder that `traps benchmark sample` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
     parser.add_argument("--reveal", type=Path, required=True, metavar="FILE", help="the seed and a secret number")
 
     text = "prove that a revealed benchmark is the one that was committed"
-    parser = commands.add("verify-commitment", verify_commitment, text, workspace=False)
-    parser.add_argument("commitment", type=Path)
-    parser.add_argument("reveal", type=Path)
+    example = "commitment.json reveal.json --specs private"
+    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
+    parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
+    parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
     parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
 
 def release(arguments: argparse.Namespace) -> int:
-    """See `traps release --help`."""
+    """See `traps publish release --help`."""
     from traps_pipeline.base.extras import require
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
@@ -85,7 +91,7 @@ def release(arguments: argparse.Namespace) -> int:
         print(f"which item is which, for you alone: {written.answers}")
     if arguments.sign:
         print(f"signature: {sign(target, arguments.sign)}")
-    print(f"next: read {target / CARD}; traps verify {target}")
+    print(f"next: read {target / CARD}; traps publish verify {target}")
     return OK
 
 
@@ -100,19 +106,22 @@ def _date(text: str | None) -> str | None:
 
 
 def verify(arguments: argparse.Namespace) -> int:
-    """See `traps verify --help`."""
+    """See `traps publish verify --help`."""
     from traps_pipeline.release.checksums import altered_files, read_checksums
 
     if not arguments.path.is_dir():
         if arguments.key:
             raise TrapsError(f"--key: only folders are signed, and {arguments.path} is none; leave it out")
-        return verify_file(arguments.path, arguments.release)
+        return verify_file(arguments.path, arguments.release, is_json=arguments.json)
     problems = altered_files(arguments.path)
     if arguments.key:
         from traps_pipeline.release.signing import check_signature
 
         wrong = check_signature(arguments.path, arguments.key)
         problems += [wrong] if wrong else []
+    if arguments.json:
+        print_json({"problems": problems, "files": len(read_checksums(arguments.path))})
+        return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:
@@ -123,7 +132,7 @@ def verify(arguments: argparse.Namespace) -> int:
 
 
 def harness(arguments: argparse.Namespace) -> int:
-    """See `traps harness --help`."""
+    """See `traps publish harness --help`."""
     from traps_pipeline.release.harness.write import LMMS, shown, write_harness
 
     target = arguments.folder.absolute()
@@ -135,7 +144,7 @@ def harness(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
-    """See `traps commit --help`."""
+    """See `traps benchmark commit --help`."""
     from traps_pipeline.release.commitment import commit
 
     made = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
@@ -145,7 +154,7 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
 
 
 def verify_commitment(arguments: argparse.Namespace) -> int:
-    """See `traps verify-commitment --help`."""
+    """See `traps benchmark prove --help`."""
     from traps_pipeline.release import commitment as sealed
 
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)

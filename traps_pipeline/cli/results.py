@@ -1,46 +1,50 @@
-"""`traps audit`, `export` and `compare`: check the published tables, write results, compare studies."""
+"""`traps results audit`, `export` and `compare`: check the published tables, write results, compare studies."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of
+from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add `traps audit`, `traps export` and `traps compare`."""
+    """Add the commands of results."""
     text = "recompute published values from other published tables, and compare"
-    parser = commands.add("audit", audit_published, text, workspace=False)
+    parser = commands.add("results audit", audit_published, text, example="--all", workspace=False, json=True)
     parser.add_argument("--all", action="store_true", help="show also the statements that agree")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
-    parser = commands.add("export", export_results, "write every table, figure and page to a folder")
+    text = "write every table, figure and page to a folder"
+    parser = commands.add("results export", export_results, text, example="results")
     parser.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
 
-    parser = commands.add(
-        "compare", compare_studies, "print this study minus another on their common pairs, with paired intervals"
-    )
+    text = "print this study minus another on their common pairs, with paired intervals"
+    parser = commands.add("results compare", compare_studies, text, example=".workspaces/earlier", json=True)
     parser.add_argument("other", type=Path, help="folder of the other study, such as an earlier benchmark version")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every row to a file")
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """See `traps audit --help`. Discrepancies of the published tables are findings, not failures."""
+    """See `traps results audit --help`. Discrepancies of the published tables are findings, not failures."""
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()
-    print(audit_text(findings, arguments.all))
+    if arguments.json:
+        print_json(findings)
+    else:
+        print(audit_text(findings, arguments.all))
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(findings))
-        print(f"every finding: {arguments.csv}")
+        print(f"every finding: {arguments.csv}", file=sys.stderr)
     return OK
 
 
 def export_results(arguments: argparse.Namespace) -> int:
-    """See `traps export --help`."""
+    """See `traps results export --help`."""
     from traps_pipeline.report.publish import INDEX, export
 
     workspace = open_workspace(arguments)
@@ -51,7 +55,7 @@ def export_results(arguments: argparse.Namespace) -> int:
 
 
 def compare_studies(arguments: argparse.Namespace) -> int:
-    """See `traps compare --help`."""
+    """See `traps results compare --help`."""
     from traps_pipeline.judging.judging_rows import VERDICTS
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
@@ -62,6 +66,9 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     table = version_contrasts(then, now)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))
+    if arguments.json:
+        print_json(table)
+        return OK
     words = {True: "yes", False: "no"}
     separable = [words.get(value, "too few") for value in table["separable"]]
     separable = ["-" if p != p else word for word, p in zip(separable, table["p"], strict=True)]

@@ -17,10 +17,12 @@ from traps_pipeline.cli.command import (
     OK,
     OVER_BUDGET,
     Commands,
+    add_experiment,
     add_panel,
     experiment_of,
     load_definitions,
     number,
+    print_json,
     whole,
 )
 from traps_pipeline.cli.init import create
@@ -38,8 +40,9 @@ MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of
 
 def add(commands: Commands) -> None:
     """Add `traps run`."""
-    parser = commands.add("run", run, "materialize every missing or stale partition of an experiment")
-    parser.add_argument("experiment")
+    text = "make every missing or stale partition of an experiment, and print the leaderboard"
+    parser = commands.add("study run", run, text, example="demo --until leaderboard", is_paid=True, json=True)
+    add_experiment(parser)
     add_panel(parser)
     parser.add_argument(
         "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
@@ -93,13 +96,15 @@ def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
     from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import make_progress
+    from traps_pipeline.scoring.score_rows import LEADERBOARD
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
     load_definitions()
     from traps_pipeline.pipeline.experiment_run import run_experiment
 
-    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
+    about = sys.stderr if arguments.json else sys.stdout
+    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", file=about, flush=True)
     with reporting(make_progress(arguments.progress)) as shown:
         report = run_experiment(
             workspace,
@@ -109,16 +114,22 @@ def run(arguments: argparse.Namespace) -> int:
             look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
             open_runs=partial(_open_runs, arguments),
         )
-    _print_work(report, is_inside=experiment.mechanism is not None)
+    if not arguments.json:
+        _print_work(report, is_inside=experiment.mechanism is not None)
     if experiment.canary and not report.problems:
         from traps_pipeline.checks.canary import ask_canary, changes_text
 
         with reporting(make_progress(arguments.progress)):
             changes = ask_canary(workspace, experiment.models)
-        print(changes_text(changes))
+        print(changes_text(changes), file=about)
+    if arguments.json:
+        board = workspace.tables.read_all(LEADERBOARD)
+        print_json({"workspace": str(workspace.place), "run": report, "leaderboard": board})
     if report.problems:
         _print_problems(report.problems)
         return OVER_BUDGET if report.over_budget else FAILED
+    if arguments.json:
+        return OK
     if arguments.until is not None:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK

@@ -10,7 +10,8 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace
 
 def add(commands: Commands) -> None:
     """Add `traps site`."""
-    parser = commands.add("site", site, "write a folder to explore all answers and clips in; it opens from disk")
+    text = "write a folder to explore all answers and clips in; it opens from disk"
+    parser = commands.add("results site", site, text, example="site --without-clips")
     parser.add_argument("folder", nargs="?", type=Path, help="default: `site` in the study's folder")
     parser.add_argument("--without-clips", action="store_true", help="leave the clips out, for a small folder")
 

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.terminal import plain, text_table
-from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace
+from traps_pipeline.cli.command import (
+    OK,
+    Commands,
+    add_experiment,
+    experiment_of,
+    load_definitions,
+    open_workspace,
+    print_json,
+)
 
-SHOWN = 8  # stale partitions that are listed for a stage
+if TYPE_CHECKING:
+    from traps_pipeline.storage.workspace import Workspace
+
+MOST_KEYS, MOST_REASON = 4, 300  # partitions and characters that are printed for a reason
 
 
 def add(commands: Commands) -> None:
     """Add `traps status` and `traps why`."""
-    parser = commands.add("status", status, "list fresh, stale and missing partitions, with the reasons")
-    parser.add_argument("experiment", nargs="?")
-    parser = commands.add(
-        "why", why, "show an item, its answers and votes, and say which answers are valid and which will be asked again"
-    )
+    text = "say what is not fresh, why, and which command makes it again"
+    parser = commands.add("study status", status, text, example="demo", json=True)
+    add_experiment(parser, nargs="?", help="only what this one wants (default: the whole study)")
+    text = "show an item, its answers and votes, and say which answers are valid and which will be asked again"
+    parser = commands.add("study why", why, text, example="occlusion:domino_chain-0001:void", json=True)
     parser.add_argument("item", help="dataset:scenario:side")
 
 
@@ -28,34 +41,58 @@ def status(arguments: argparse.Namespace) -> int:
     if experiment is not None and experiment not in workspace.study.experiments:
         raise TrapsError(
             f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
+            + did_you_mean(experiment, workspace.study.experiments)
         )
     from traps_pipeline.pipeline.lineage import Lineage
-    from traps_pipeline.pipeline.study_status import stage_statuses
+    from traps_pipeline.pipeline.study_status import failing_checks, stage_statuses
 
     load_definitions()
-    lineage = Lineage(workspace)
-    rows = list(stage_statuses(workspace, lineage, experiment))
-    counts = [(row.stage, row.fresh, len(row.stale), row.missing) for row in rows]
-    lines = text_table(("stage", "fresh", "stale", "missing"), counts).splitlines()
-    print("\n".join([f"workspace {workspace.place}", *lines[: -len(rows)]]))
-    for line, row in zip(lines[-len(rows) :], rows, strict=True):
+    rows = list(stage_statuses(workspace, Lineage(workspace), experiment))
+    checks = [*failing_checks(workspace)]
+    command = _command(workspace, arguments.experiment)
+    if arguments.json:
+        names = ("check", "stage", "partition", "reason")
+        failing = [dict(zip(names, check, strict=True)) for check in checks]
+        print_json({"workspace": str(workspace.place), "command": command, "checks": failing, "stages": rows})
+        return OK
+    print(f"workspace {workspace.place}")
+    for check, stage, partition, reason in checks:
+        print(plain(f"check {check} of {stage} {partition} does not pass: {reason}"))
+    total, behind = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
+    if not behind:
+        print(f"all {total:,} partitions of {len(rows)} stages are fresh")
+        return OK
+    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in behind]
+    lines = text_table(("stage", "fresh", "stale", "missing"), table).splitlines()
+    print("\n".join(lines[: -len(behind)]))
+    for line, row in zip(lines[-len(behind) :], behind, strict=True):
         print(line)
-        for key, reasons in list(row.stale.items())[:SHOWN]:
-            print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
-        if len(row.stale) > SHOWN:
-            print(f"    ... and {len(row.stale) - SHOWN} more")
-    for file in workspace.store.below(workspace.root / "checks", "*/*/*.json"):
-        stage, check = file.parts[-3:-1]
-        said = workspace.store.here(file).read_text(encoding="utf-8")[:200]
-        print(f"check {check} of {stage} {file.stem} does not pass: {said}")
-    print("stale: made from something that has changed since; `traps run EXPERIMENT` makes it again")
+        for reason, keys in row.by_reason().items():
+            more = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
+            which = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
+            print(plain(f"    {which}{reason[:MOST_REASON]}"))
+    count = sum(len(row.stale) + len(row.missing) for row in behind)
+    print(f"{count:,} of {total + count:,} partitions are not fresh; `{command}` makes them")
     return OK
+
+
+def _command(workspace: Workspace, experiment: str | None) -> str:
+    """Return the command that makes what is not fresh: of the experiment that was given, or of the study's only one."""
+    from traps_pipeline.pipeline.experiment import EXPERIMENTS
+
+    names = [name for name in workspace.study.experiments if (EXPERIMENTS / f"{name}.yaml").exists()]
+    is_only = len(names) == len(workspace.study.experiments) == 1
+    return f"traps run {experiment or (names[0] if is_only else 'EXPERIMENT')}"
 
 
 def why(arguments: argparse.Namespace) -> int:
     """See `traps why --help`."""
-    from traps_pipeline.pipeline.stale_reasons import why as explain
+    from traps_pipeline.pipeline.stale_reasons import explain, lines_of
 
-    for line in explain(open_workspace(arguments), arguments.item):
+    explanation = explain(open_workspace(arguments), arguments.item)
+    if arguments.json:
+        print_json(explanation)
+        return OK
+    for line in lines_of(explanation):
         print(plain(line))
     return OK

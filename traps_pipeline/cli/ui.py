@@ -15,7 +15,8 @@ _OWN_S = 5.0  # the second process's own, after all that it started has ended
 
 def add(commands: Commands) -> None:
     """Add `traps ui`."""
-    parser = commands.add("ui", ui, "Dagster's web server and daemon; prints the address to open, with its token")
+    text = "start Dagster's web server and daemon; print the address to open, with its token"
+    parser = commands.add("study ui", ui, text, example="--port 3001")
     parser.add_argument("--port", type=whole(1, 65535), default=3000, help="of the web server (default: 3000)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone)")
     parser.add_argument(

@@ -157,7 +157,7 @@ class ConfabulationRow(shared.CellRow):
 CONFABULATION = Table("confabulation", ConfabulationRow, partition_by=(), key=("model", "item_id"))
 
 
-# A command makes this table from a file that people wrote, so it is no stage; `traps confabulation validate` writes it.
+# A command makes this table from a file that people wrote, so it is no stage; `traps people validate` writes it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeValidationRow:
     """The confabulation judge against two blind annotators on one axis, or pooled over the four."""
@@ -189,7 +189,7 @@ class JudgeValidationRow:
 JUDGE_VALIDATION = Table("judge_validation", JudgeValidationRow, partition_by=(), key=("axis",))
 
 
-# A command makes this table, so it is no stage; `traps judges check` writes it.
+# A command makes this table, so it is no stage; `traps models test-panel` writes it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeRobustnessRow:
     """One judge's vote on one task about an answer that tries to instruct it (assets/injected_answers.yaml)."""

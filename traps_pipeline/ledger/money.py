@@ -101,7 +101,7 @@ class Money:
                 raise TrapsError(
                     f"{participant}: ${dollars:.4f} cannot be released: ${room.in_flight:.4f} are booked for calls in "
                     f"flight when a process died and ${room.failed:.4f} for failed ones; give --usd with at most "
-                    f"{most:.4f}, or a participant that `traps ledger release` lists"
+                    f"{most:.4f}, or a participant that `traps study release-money` lists"
                 )
             in_flight = min(dollars, room.in_flight)
             failed = min(dollars, most) - in_flight

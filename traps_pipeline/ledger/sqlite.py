@@ -121,7 +121,7 @@ class SqliteDatabase(Database):
             try:
                 for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
                     if fault != "ok":
-                        yield f"{self.path}: {fault}; what can be read goes on elsewhere by `traps ledger export`"
+                        yield f"{self.path}: {fault}; what can be read goes on elsewhere by `traps study export-ledger`"
             except exc.DBAPIError as error:
                 raise sentence(error, self.place) from error
 

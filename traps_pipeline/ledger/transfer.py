@@ -30,13 +30,13 @@ def export_ledger(ledger: Database, file: Path) -> int:
 def import_ledger(file: Path, ledger: Database) -> int:
     """Read the ledger of a file into a study that has none; the number of rows. Raises TrapsError."""
     if not file.is_file():
-        raise TrapsError(f"{file}: no such file; name one that `traps ledger export` wrote")
+        raise TrapsError(f"{file}: no such file; name one that `traps study export-ledger` wrote")
     source = SqliteDatabase(file.parent, file=file.name)
     with source.read() as connection:
         names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()]
     if len(names) != 1:
         raise TrapsError(
-            f"{file}: holds {len(names)} studies, and not one; name a file that `traps ledger export` wrote"
+            f"{file}: holds {len(names)} studies, and not one; name a file that `traps study export-ledger` wrote"
         )
     source.study_name = names[0]
     return copy_ledger(source, ledger)
@@ -74,7 +74,7 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
     if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(others)).limit(1)).first():
         raise TrapsError(
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
-            "one by one with `traps answers import`"
+            "one by one with `traps study import-answers`"
         )
     # What a copy that was killed has left, and evaluations without a row, would be in the way.
     batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(mine)))

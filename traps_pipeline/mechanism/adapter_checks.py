@@ -20,7 +20,6 @@ from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, record, require_patchable
 from traps_pipeline.models.local.model import LocalModel
-from traps_pipeline.models.local.prefixes import PrefixMemory, resumable
 from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.selfcheck import tiny_model
 from traps_pipeline.models.local.spans import spans
@@ -206,21 +205,6 @@ def _clips(subject: Subject) -> str:
     return "seen once" if memory.passes == 1 else "seen by every pass"
 
 
-def _resumed(subject: Subject) -> str:
-    model, before = subject.model, subject.model.prefixes
-    sheet = subject.steered(0.5, -0.5, 0.25)
-    plain = model.generate(subject.prompts, NEW_TOKENS, steering=sheet)
-    model.prefixes = PrefixMemory()
-    try:
-        with model.resuming(), model.remembering_clips():
-            made = model.generate(subject.prompts, NEW_TOKENS, steering=sheet)
-        passes = model.prefixes.passes
-    finally:
-        model.prefixes = before
-    _require([a.tokens for a in made] == [a.tokens for a in plain], "a resumed answer is another one")
-    return "resumed at the steered block" if passes and resumable(model) else "every pass is whole"
-
-
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
     with _ending(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
@@ -249,7 +233,6 @@ CHECKS = (
     Check("means", "the mean over the question's tokens is that of the library's states", _pooled),
     Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _patching),
     Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
-    Check("resuming", "steered answers go on from the steered block, and stay as they are", _resumed),
     Check("batches", "answers do not depend on their batch, nor on rows that leave it", _batches),
 )
 

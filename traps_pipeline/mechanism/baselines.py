@@ -1,8 +1,7 @@
 """What a probe must beat: the same protocol on raw inputs, on the model's own output, and on noise.
 
 Every baseline replaces the states of an item by other features and leaves the rest as it is: the same items, folds,
-solver, intervals and targets (`probing.ProbeRun`). Other probes of the states, where the experiment names some, stand
-beside them, at the layer that is steered. A probe on states says nothing about understanding where the
+solver, intervals and targets (`probing.ProbeRun`). A probe on states says nothing about understanding where the
 question's words, the first frame, the clip's length or the time stamps separate as well; and nothing about a gap
 between representation and output where the output margin does.
 """
@@ -19,12 +18,10 @@ import pandas as pd
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.control_rows import ProbeBaselineRow
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.other_probes import OF_PAIRS, fit_named
 from traps_pipeline.mechanism.probes import Fit
-from traps_pipeline.mechanism.probing import Confabulated, ProbeRun, Row
+from traps_pipeline.mechanism.probing import ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import ModelEntry
@@ -69,16 +66,6 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     except NoMargin as error:
         add(MARGIN, [_without_figure()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
-    layer = settings.models[entry.id].steering
-    for name in settings.probes.others:
-        fit = fit_named(name, settings.seed)
-        at_layer = (
-            contrast_states(workspace, states.extraction, layer, [*items])
-            if name in OF_PAIRS
-            else {dataset: states.read(dataset, layer) for dataset in items}
-        )
-        others = replace(run, read=lambda dataset, _, of=at_layer: of[dataset], fit=fit, confabulated=Confabulated({}))
-        add(f"states, {name}", others.comparable(0))
     return found
 
 

@@ -198,6 +198,24 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 
 @dataclass(frozen=True, kw_only=True)
+class SentenceRow(Extracted):
+    """How likely an abstention is to a model behind an item, beside its own answer: under the benchmark's prompt of
+    that name."""
+
+    item_id: shared.ItemId
+    dataset: shared.Dataset
+    scenario_id: shared.ScenarioId
+    side: shared.Side
+    sentence: Annotated[str, "the likeliest of the study's abstentions"]
+    abstention: Annotated[float, "its mean log-probability, nats a token"]
+    own: Annotated[float | None, "the same of the model's answer of run 1; null without a text"]
+    own_tokens: Annotated[int, "tokens of that answer that count, from its beginning"]
+
+
+SENTENCES = Table("sentences", SentenceRow, partition_by=("model", "prompt"), key=("item_id",))
+
+
+@dataclass(frozen=True, kw_only=True)
 class PatchingRow(Extracted):
     """The indirect effect of a group of positions at one site and layer, over the pairs of a dataset."""
 

@@ -1,5 +1,5 @@
 """A gate in memory, which decides about prompts that are shown to a model now: the same probe and threshold as those
-that the gate stage counts, for a notebook and as the condition under which a study steers."""
+that the gate stage counts, for a notebook."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.directions import steered_scenarios
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
@@ -104,26 +103,3 @@ def _train(states: StoredStates, source: str, target: str, layer: int, without: 
     unseen = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
     features = {name: states.read(name, layer) for name in names}
     return gate_items(table, features, shuffled=False, seed=0).rows(unseen)
-
-
-def conditions(workspace: Workspace, extraction: Extraction) -> dict[tuple[str, int], Gate]:
-    """By source dataset and layer, the gates that decide where steering with `when` acts, fitted without the scenarios
-    that are steered; empty where the study steers all items. The gate of a path is of the dataset whose direction it
-    takes. Raises TrapsError where too few scenarios are left."""
-    settings = workspace.mechanism
-    steering = settings.steering
-    if steering is None or steering.when is None:
-        return {}
-    states, layers = StoredStates.of(workspace, extraction), settings.models[extraction.model]
-    steered = set[str]()
-    sources = [name for name in DATASETS if not states.dataset(name).empty]
-    for name in sources:
-        scenarios = sorted(set(states.dataset(name)["scenario_id"]))
-        steered |= {*steered_scenarios(scenarios, steering.pairs, settings.seed)}
-    return {
-        (name, layer): fitted_gate(
-            workspace, extraction, source=f"one:{name}", threshold=steering.when, layer=layer, without=steered
-        )
-        for name in sources
-        for layer in sorted({layers.steering, *layers.sweep})
-    }

@@ -42,13 +42,13 @@ def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
 
 
 def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """The first n scenarios of the seeded order of a taxonomy, which are steered in every cell."""
+    """Return the first n scenarios of the seeded order of a taxonomy, which are steered along every direction that does
+    not come from them."""
     return seeded_order(scenarios, seed)[:n]
 
 
 def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """The last n scenarios of the same order, from which a direction is computed; where there are enough scenarios,
-    none of these is steered."""
+    """Return the last n scenarios of the same order, from which a direction is computed."""
     return seeded_order(scenarios, seed)[-n:]
 
 
@@ -77,11 +77,12 @@ class Origin:
 class Directions:
     """Directions of one dataset at every layer. vectors: kind -> (draws, layers, d) float32 unit vectors, with one draw
     of kind void. gaps: (layers,), length of mean(h_void) - mean(h_control), the class gap. residual_norms: (layers,),
-    mean length of the control states."""
+    mean length of the control states. scenarios: of the pairs that they come from, which are not steered along them."""
 
     vectors: Mapping[str, np.ndarray]
     gaps: np.ndarray
     residual_norms: np.ndarray
+    scenarios: frozenset[str] = frozenset()
 
     @property
     def void(self) -> np.ndarray:
@@ -182,7 +183,9 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
     if not {VOID, *_LENGTHS} <= set(tensors):
         raise TrapsError(f"{path}: was written by an earlier version; delete it, then `traps run` makes it again")
     return Directions(
-        {kind: tensors[kind] for kind in KINDS if kind in tensors}, **{n: tensors[n] for n in _LENGTHS}
+        {kind: tensors[kind] for kind in KINDS if kind in tensors},
+        **{n: tensors[n] for n in _LENGTHS},
+        scenarios=frozenset(description["scenarios"]),
     ), description
 
 

@@ -64,5 +64,5 @@ def layer_margins(model: LocalModel, states: Any, tokens: list[int]) -> np.ndarr
     import torch
 
     with torch.inference_mode():
-        raw = torch.as_tensor(np.asarray(states)).to(model.device, model.network.dtype)
+        raw = torch.as_tensor(np.asarray(states)).to(model.inputs_device, model.network.dtype)
         return first_token_margins(model, model.norm(raw), tokens).double().numpy()

@@ -61,11 +61,17 @@ def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -
     """The margins (n,) of states (n, d) that left the final norm at the last position of a prompt, on the CPU."""
     import torch
 
+    with torch.inference_mode():
+        states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
+        never = model.network.generation_config.suppress_tokens or ()
+        return margin_of(head_logits(model, states), tokens, never).cpu()
+
+
+def head_logits(model: LocalModel, normed: Tensor) -> Tensor:
+    """Return the logits (n, vocabulary) float32 of states (n, d) that left the final norm."""
+    import torch
+
     head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()
-    states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
-    logits = head(states.to(model.device, model.network.dtype)).float()
+    logits = head(normed.to(head.weight.device, model.network.dtype)).float()
     cap = getattr(config, "final_logit_softcapping", None)
-    if cap:
-        logits = torch.tanh(logits / cap) * cap
-    never = model.network.generation_config.suppress_tokens or ()
-    return margin_of(logits, tokens, never).cpu()
+    return torch.tanh(logits / cap) * cap if cap else logits

@@ -16,12 +16,7 @@ AnswerRegime = Annotated[str, "system prompt of the steered answer"]
 SteeredSource = Annotated[str, "dataset of the direction; none where alpha is 0"]
 SteeredKind = Annotated[str, "void, or a null: isotropic, covariance or shuffled; none where alpha is 0"]
 Draw = Annotated[int, "number of a null's draw; 0 for void"]
-PROJECT_OUT, CLAMP = "project out", "clamp"  # units of doses that do not only add
-DoseUnit = Annotated[
-    str,
-    "of the dose: alpha; gap (the distance between the sides' means at the layer); project out (the share of a "
-    "state's part along the direction that is taken out); clamp (what that part is set to, in gaps)",
-]
+DoseUnit = Annotated[str, "of the dose: alpha, or gap (the distance between the sides' means at the layer)"]
 Dose = Annotated[float, "strength in that unit; 0 is the unsteered model"]
 Signs = Annotated[str, "label: added on controls and subtracted on voids; plus or minus: the same on both sides"]
 SteeredLayer = Annotated[int, "steered block, counted as in hidden_states; 0 where alpha is 0"]
@@ -174,7 +169,6 @@ class DirectionRow(Extracted):
     draw: Draw
     layer: Layer
     n_pairs: Annotated[int, "pairs from which it was computed"]
-    n_steered: Annotated[int, "of these, pairs that are steered as well (0 if there are enough scenarios)"]
     norm: Annotated[float, "the class gap: length of mean(void) - mean(control)"]
     cosine: Annotated[float, "with the void direction of the same layer; 0 for a null, up to rounding"]
     residual_norm: Annotated[
@@ -233,10 +227,9 @@ class SteeringRow(SteeredCell):
     served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
     completion_tokens: shared.Tokens
     degenerate: Annotated[
-        str | None, "why the text is no answer: truncated, empty, repetition, script or language; null if it is one"
+        str | None, "why the text is no answer: truncated, empty, repetition or script; null if it is one"
     ]
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
-    place: Annotated[str, "where the direction acts: site, tokens, and under which condition"]
     request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
     epoch: shared.Epoch
     created_at: shared.AskedAt
@@ -306,7 +299,7 @@ class SteeringEffectRow:
     high: shared.Wilson
     correct: Annotated[int, "answers to controls that are correct"]
     n_correct: Annotated[int, "answers to controls that were decided for correctness"]
-    degenerate: Annotated[int, "answers cut off, repetitive, or in another script or language than the unsteered one"]
+    degenerate: Annotated[int, "answers cut off, repetitive, or in another script than the unsteered one"]
     epoch: shared.AnswerEpochs
 
 

@@ -25,6 +25,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.control_rows import PatchingRow
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.hidden_states import shown_times
+from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.patching_effects import (
@@ -36,7 +37,6 @@ from traps_pipeline.mechanism.patching_effects import (
     require_patchable,
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
-from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry

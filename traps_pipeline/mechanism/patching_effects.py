@@ -36,8 +36,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
-from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.capture import first_tensor
 from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, given, giving, unknown_path
 from traps_pipeline.models.local.spans import visual_tokens
@@ -182,7 +182,7 @@ def patched_changes(
     order = sorted(range(len(patches)), key=lambda i: _first_layer(model, patches[i]))
     for chosen in (order[k : k + rows] for k in range(0, len(order), rows)):
         batch = [patches[i] for i in chosen]
-        weights = _masks(batch, target.length, model.device)
+        weights = _masks(batch, target.length, model.inputs_device)
         with torch.inference_mode():
             margins = _margins(model, target, source, weights, _first_layer(model, batch[0]), 1 + len(batch), tokens)
         changes[chosen] = (margins[1:] - margins[0]).double().numpy()
@@ -335,6 +335,9 @@ def _replacing(
         for below, block in enumerate(blocks[start:], start=start):
             hooks.callback(block.register_forward_pre_hook(partial(beside, below), with_kwargs=True).remove)
         for layer, block in enumerate(blocks[:start], start=1):
+            own = vars(block).get("forward")  # of a model that accelerate spreads over devices
             block.forward = partial(skip, layer)
-            hooks.callback(vars(block).pop, "forward")
+            hooks.callback(
+                partial(vars(block).pop, "forward") if own is None else partial(setattr, block, "forward", own)
+            )
         yield

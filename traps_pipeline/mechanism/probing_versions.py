@@ -15,7 +15,7 @@ from traps_pipeline.models.registry import ModelEntry, effective_params, get_mod
 from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.media import profile_digest
-from traps_pipeline.storage.study import ACTING
+from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 
 SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
@@ -28,6 +28,12 @@ def loaded_params(entry: ModelEntry) -> dict[str, Any]:
     params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
     skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
     return params | {"quantisation": inside.quantisation} | skipped
+
+
+def shown_inside(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
+    """Return a model's entry with the media that the study shows it where it is looked into."""
+    media = settings.models[entry.id].media
+    return entry if media is None else entry.model_copy(update={"media": media})
 
 
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
@@ -58,6 +64,8 @@ def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
     """Digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt, pooling."""
     entry, settings = get_model(extraction.model), workspace.study.mechanism
+    if settings is not None and entry.id in settings.models:
+        entry = shown_inside(entry, settings)
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
     system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
@@ -81,6 +89,15 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
     return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES, gate])[:16]
 
 
+def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
+    """Digest of the inputs of sentences besides items and answers: those of states, the sentences, the prompt."""
+    settings = workspace.study.mechanism
+    if settings is None or extraction.model not in settings.models:
+        return "none"
+    prompt = system_prompt(extraction.prompt)
+    return digest([extraction_version(workspace, extraction), list(settings.sentences), prompt])[:16]
+
+
 def patching_version(workspace: Workspace, extraction: Extraction) -> str:
     """Digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
     settings = workspace.study.mechanism
@@ -96,7 +113,7 @@ def steering_version(workspace: Workspace, run: str) -> str:
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:
         return "none"
-    steering = settings.steering.model_dump(mode="json", exclude=set(ACTING)) | settings.steering.acting
-    chosen = steering, settings.models[model].model_dump(mode="json"), settings.seed
+    entry = shown_inside(entry, settings)
+    chosen = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
     media = profile_digest(entry.media) if entry.media else None
     return digest([*chosen, loaded_params(entry), media, system_prompt(regime)])[:16]

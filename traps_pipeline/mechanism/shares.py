@@ -55,8 +55,9 @@ def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
     plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=_ALONG)
-    paths = steered[[*_RUN, "dataset", *_ALONG, "side"]].drop_duplicates()
-    return pd.concat([steered, plain.merge(paths, on=[*_RUN, "dataset", "side"])], ignore_index=True)
+    same = [*_RUN, "dataset", "side", "scenario_id"]  # a path is compared with the model as it is on its own scenarios
+    paths = steered[[*same, *_ALONG]].drop_duplicates()
+    return pd.concat([steered, plain.merge(paths, on=same)], ignore_index=True)
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:

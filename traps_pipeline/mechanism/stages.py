@@ -19,7 +19,6 @@ from traps_pipeline.mechanism.directions import (
     extract_directions,
     load_directions,
     save_directions,
-    steered_scenarios,
     vector_digest,
 )
 from traps_pipeline.mechanism.mechanism_rows import (
@@ -32,13 +31,13 @@ from traps_pipeline.mechanism.mechanism_rows import (
 )
 from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.probing_versions import states_folder
+from traps_pipeline.mechanism.probing_versions import shown_inside, states_folder
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
-from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -53,7 +52,8 @@ COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "questio
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """The entry of a model in the study's `mechanism` section. Raises TrapsError if it is not local, or not there."""
+    """Return the entry of a model in the study's `mechanism` section, with the media that it is shown there. Raises
+    TrapsError if it is not local, or not there."""
     entry, settings = get_model(model), workspace.mechanism
     if entry.backend != LOCAL:
         local = ", ".join(name for name in settings.models if get_model(name).backend == LOCAL) or "none of the study's"
@@ -63,7 +63,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
         )
     if model not in settings.models:
         raise TrapsError(f"study.yaml: mechanism.models does not name {model}; add it with its layers")
-    return entry
+    return shown_inside(entry, settings)
 
 
 # --- hidden states ----------------------------------------------------------------------------------------------------
@@ -230,8 +230,7 @@ def direction_pairs(
             "study.yaml: mechanism.steering is null, so the number of pairs for a direction is not known; set it there "
             "and in the experiment"
         )
-    most = steering.ill_posed_pairs if is_ill_posed(dataset) else steering.well_posed_pairs
-    chosen = direction_scenarios(sorted(set(items["scenario_id"])), most, settings.seed)
+    chosen = direction_scenarios(sorted(set(items["scenario_id"])), steering.direction_pairs(dataset), settings.seed)
     place = {
         (name, side): row for row, (name, side) in enumerate(zip(items["scenario_id"], items["side"], strict=True))
     }
@@ -244,8 +243,6 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     steering = settings.steering
     chosen, *sides = direction_pairs(settings, dataset, items)
     assert steering is not None, "direction_pairs refuses a study that steers nothing"
-    names = sorted(set(items["scenario_id"]))
-    steered = set(steered_scenarios(names, steering.pairs, settings.seed)) & set(chosen)
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
     voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
     seed = [settings.seed, DATASETS.index(dataset)]
@@ -274,7 +271,6 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
             draw=draw,
             layer=layer,
             n_pairs=len(chosen),
-            n_steered=len(steered),
             norm=float(directions.gaps[layer]),
             cosine=float(vectors[layer] @ directions.void[layer]),
             residual_norm=float(directions.residual_norms[layer]),

@@ -3,9 +3,7 @@
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
 three, so that all directions share one answer. The two datasets of a taxonomy have the same control items, and share
-their answers too; so do two sign policies where they add the same. What takes out a state's part along a direction, or
-sets it, is steering too, with the share that is taken out in the key. Where a study steers another site than the
-residual stream, a part of the prompt alone, or only where a gate says so, the key holds that as well.
+their answers too; so do two sign policies where they add the same.
 
 Doses are given as alphas, the paper's, and in units of the class gap, since one alpha is a large step in one model and
 none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
@@ -23,11 +21,10 @@ from typing import Any, NamedTuple
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
-from traps_pipeline.mechanism.deciding import Gate, conditions
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
-from traps_pipeline.mechanism.mechanism_rows import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
+from traps_pipeline.mechanism.mechanism_rows import STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
@@ -38,7 +35,7 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
-from traps_pipeline.protocol.cells import Extraction, SteeringCell
+from traps_pipeline.protocol.cells import SteeringCell
 from traps_pipeline.protocol.datasets import SIDES, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import Made
@@ -52,8 +49,7 @@ BY_LABEL = "label"  # the paper's sign policy, which knows the side of each item
 @dataclass(frozen=True)
 class Strength:
     """One direction at one strength. alpha has no sign: `signs` says on which side alpha times the direction is added
-    and on which it is subtracted. dose: in its unit, one of DoseUnit. removed: the share of a state's part along the
-    direction that is taken out first. gate: what the gate is made of that decides whether it is steered at all."""
+    and on which it is subtracted. dose: in its unit, one of DoseUnit."""
 
     source: str
     kind: str
@@ -65,8 +61,6 @@ class Strength:
     unit: str = "alpha"
     dose: float = 0.0
     signs: str = BY_LABEL
-    removed: float = 0.0
-    gate: str | None = None
 
     def signed(self, side: str) -> float:
         """The signed alpha for a row of that side."""
@@ -116,25 +110,27 @@ def strengths(
                 f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
                 "there; name another layer in the experiment and in study.yaml"
             )
-        for unit, dose in row.doses:
-            alpha, removed = _change(unit, dose, float(of.gaps[layer]))
+        for unit, dose in _within(row, of, layer, steering.cap):
+            alpha = dose * float(of.gaps[layer]) if unit == "gap" else dose
             relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
-            wanted.append((Strength(*along, row.draw, unit, dose, row.signs, removed), row.sides))
+            wanted.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
     return wanted
 
 
 Dose = tuple[str, float]  # unit and number
 
 
-def _change(unit: str, dose: float, gap: float) -> tuple[float, float]:
-    """What is added along a direction, and the share of a state's part along it that is taken out first."""
-    added = {"alpha": float(dose), "gap": float(dose * gap), PROJECT_OUT: 0.0, CLAMP: float(dose * gap)}[unit]
-    return added, {PROJECT_OUT: float(dose), CLAMP: 1.0}.get(unit, 0.0)
+def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
+    """Return the doses of a direction without those in class gaps that are longer than `cap` control states; of a null
+    the largest one."""
+    longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
+    kept = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
+    return kept if row.kind == "void" else kept[-1:]
 
 
 class _Planned(NamedTuple):
-    """A direction along which a target is steered, with the sides and doses."""
+    """A direction along which a target is steered, with the sides and doses; a null is steered at the largest alone."""
 
     source: str
     kind: str
@@ -147,19 +143,15 @@ class _Planned(NamedTuple):
 
 def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
     """Every direction along which a target is steered, among these sources: all paths into it; along its own direction
-    also the other sign policies, what takes out or sets the part along it, the nulls at the largest dose, and on
-    controls the sweep over layers."""
+    also the other sign policies, the nulls at the largest dose, and on controls the sweep over layers."""
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
     at = layers.steering
     plan = [_Planned(source, "void", 0, at, BY_LABEL, SIDES, doses) for source in sources_of(target)]
     plan += [_Planned(target, "void", 0, at, signs, SIDES, doses) for signs in steering.signs]
-    changes: tuple[Dose, ...] = tuple((PROJECT_OUT, float(share)) for share in steering.project_out)
-    changes += tuple((CLAMP, float(gaps)) for gaps in steering.clamp)
-    plan += [_Planned(target, "void", 0, at, "plus", SIDES, changes)] if changes else []
     if steering.nulls:
         draws = product(steering.nulls.kinds, range(steering.nulls.draws))
-        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses[-1:]) for kind, draw in draws]
+        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses) for kind, draw in draws]
     sweep = [layer for layer in layers.sweep if layer != at]
     plan += [_Planned(target, "void", 0, layer, BY_LABEL, ("control",), alphas) for layer in sweep]
     return [row for row in plan if row.source in sources]
@@ -176,14 +168,18 @@ def count_answers(
     cells = set[tuple[Any, ...]]()
     for target, side in product(datasets, SIDES):
         owner = taxonomy_of(target) if side == "control" else target
-        cells.add((owner, side))
+        cells.add((owner, side, UNSTEERED))
         for row in _plan(target, settings.models[model], steering, datasets):
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
-                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, row.doses)}
+                doses = row.doses if row.kind == "void" else row.doses[-1:]
+                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, doses)}
     answers = Counter[str]()
     for cell in cells:
-        answers[cell[1]] += min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0))
+        source, taxonomy = str(cell[2]), taxonomy_of(str(cell[0]))
+        own = source != UNSTEERED and taxonomy_of(source) == taxonomy  # along a direction of its own scenarios
+        unseen = scenarios.get(taxonomy, 0) - (steering.direction_pairs(source) if own else 0)
+        answers[cell[1]] += max(0, min(steering.pairs, unseen))
     return dict.fromkeys(steering.inference_regimes, answers)
 
 
@@ -200,30 +196,21 @@ def wanted_steered(
     entry: ModelEntry,
     cell: SteeringCell,
     directions: Mapping[str, Directions],
-    gates: Mapping[tuple[str, int], Gate],
 ) -> list[SteeredQuestion]:
-    """The calls for every answer of a cell; calls about one prompt are adjacent, so that they share what the blocks
-    below the steered one make of it. gates: by source and layer (`conditions`); empty where every item is steered."""
+    """Return the calls for every answer of a cell, those about one prompt side by side: its clip is then seen once."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
     chosen = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
     rows = items.loc[items["scenario_id"].isin(chosen)].to_dict("records")
-    plan = [
-        (
-            replace(strength, gate=gate.made_of)
-            if (gate := gates.get((strength.source, strength.layer)))
-            else strength,
-            s,
-        )
-        for strength, s in strengths(cell.dataset, settings.models[entry.id], settings, directions)
-    ]
+    plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
     most = settings.steering.max_new_tokens
     return [
         SteeredQuestion(steered_request(workspace, entry, item, cell, strength, most), item, strength)
         for item in rows
         for strength, sides in plan
         if item["side"] in sides
+        and (strength.source == UNSTEERED or item["scenario_id"] not in directions[strength.source].scenarios)
     ]
 
 
@@ -240,13 +227,9 @@ def steered_request(
     clip = workspace.resolve(item["clip"])
     sent = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
-    if strength.alpha or strength.removed:
+    if strength.alpha:
         signed = strength.signed(item["side"])
         steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
-        steering |= {"removed": strength.removed} if strength.removed else {}
-        assert workspace.mechanism.steering is not None, "an experiment without steering has no steering cells"
-        steering |= workspace.mechanism.steering.acting
-        steering |= {"gate": strength.gate} if strength.gate else {}
     return Request(
         participant=entry.id,
         endpoint=entry.backend,
@@ -281,8 +264,6 @@ def collect_steered(
     Several processes may do so at once: one writes the answers of an evaluation, and whoever waits for it makes answers
     in the meantime (`made_answers`).
     """
-    assert workspace.mechanism.steering is not None, "an experiment without steering has no steering cells"
-    place = place_of(workspace.mechanism.steering)
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
@@ -292,11 +273,10 @@ def collect_steered(
         for vector in draw
     }
 
-    gates = {prompt: conditions(workspace, Extraction(entry.id, prompt)) for prompt in directions}
     made = MadeAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
-        wanted = wanted_steered(workspace, entry, cell, directions[cell.directions], gates[cell.directions])
+        wanted = wanted_steered(workspace, entry, cell, directions[cell.directions])
         made.chunks([each.request for each in wanted])
         return wanted
 
@@ -304,22 +284,15 @@ def collect_steered(
         made.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
-        return settled.made(partial(_steering_row, plain, place))
+        return settled.made(partial(_steering_row, plain))
 
     def make(entry: Entry) -> SteeredBackend:
-        return SteeredBackend(entry, vectors, made, {g.made_of: g for of in gates.values() for g in of.values()})
+        return SteeredBackend(entry, vectors, made)
 
     for cell in cells:
         if is_written(workspace.answers, cell.evaluation.key):
             _make_meanwhile(workspace, cell, calls(cell), made, make(entry))
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
-
-
-def place_of(steering: SteeringSettings) -> str:
-    """Where a study's steering acts, in a few words, for the column `place`."""
-    site = f"{steering.site} head {steering.head}" if steering.head is not None else steering.site
-    where = "all tokens" if steering.positions == "all" else f"{steering.positions} tokens"
-    return f"{site}, {where}" + (f", where a gate says so ({steering.when})" if steering.when else "")
 
 
 def _make_meanwhile(
@@ -339,7 +312,7 @@ def _make_meanwhile(
 
 
 def _steering_row(
-    plain: Mapping[str, str | None], place: str, cell: SteeringCell, question: SteeredQuestion, row: Row
+    plain: Mapping[str, str | None], cell: SteeringCell, question: SteeredQuestion, row: Row
 ) -> SteeringRow:
     item, strength = question.item, question.strength
     return SteeringRow(
@@ -352,7 +325,6 @@ def _steering_row(
         alpha_relative=strength.relative,
         degenerate=degeneracy(row["text"], row["outcome"], plain.get(item["item_id"])),
         direction_digest=strength.digest,
-        place=place,
         request_key=row["key"],
     )
 

@@ -43,6 +43,21 @@ UNKNOWN_ERROR = 500  # the status of an error object in a 200 that names none
 REFUSED_CONTENT = "content_policy"  # the error of a call whose content a provider's filter stopped
 DENIED = "http_403_denied"  # of a 403 that is not about the key
 MOST_KEPT = 4000  # characters of an answer that is out of order
+# What a person is told of a kind of failure.
+_HAPPENED = {
+    RATE_LIMITED: "asked too fast",
+    UNREACHABLE: "not reached",
+    MALFORMED: "its answer cannot be read",
+    REFUSED_CONTENT: "its filter refused the content",
+    DENIED: "it denies access",
+    "server_error": "its server failed",
+    "timeout": "no answer in time",
+    "connection": "the connection broke",
+    "ended": "its answer broke off",
+    "usage": "its count of tokens is not believed",
+    "http_401": "it does not accept the key",
+    "http_404": "it knows no such model or address",
+}
 TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 
@@ -201,7 +216,7 @@ class ApiBackend:
         cost, worst = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
         if not usage.believed and cost > worst:
             said = f"{usage.prompt} tokens of prompt and {usage.completion} of the answer"
-            self._tell("usage", f"its usage contradicts itself; the most that it says is booked ({said})")
+            self._tell("usage", f"contradicts itself; the most that it says is booked, {said}")
         return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
@@ -227,14 +242,14 @@ class ApiBackend:
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
         billed = exchange.may_be_billed(status, is_explained=is_explained)
-        place = " (an error object in an HTTP 200)" if exchange.is_answered else ""
-        place += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
+        origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
+        origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if reported.is_filtered and status not in TRANSIENT_STATUSES:
-            self._tell(REFUSED_CONTENT, f"{reported}{place}")
+            self._tell(REFUSED_CONTENT, f"{reported}{origin}")
             return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
         kind = failure_kind(status, reported)
         is_final = kind.startswith("http_")
-        self._tell(kind, f"{reported}{place}", passes=not is_final)
+        self._tell(kind, f"{reported}{origin}", passes=not is_final)
         if is_final:
             return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
         raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None
@@ -251,8 +266,9 @@ class ApiBackend:
         if kind not in self._told:
             self._told.add(kind)
             said = redact(" ".join(said.split()))  # before it is cut
-            again = " (a run tries again)" if passes else ""
-            progress.current().note(f"{self._entry.id}: {kind}{again}: {plain(said)[:300]}")
+            happened = _HAPPENED.get(kind, "a call failed")
+            again = "; a run tries again" if passes else ""
+            progress.current().note(f"{self._entry.id}: {happened}{again} ({kind}: {plain(said)[:300]})")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

@@ -14,6 +14,7 @@ from pydantic import model_validator
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import read_mapping
 from traps_pipeline.models import own
 from traps_pipeline.models.prompts import prompt
@@ -124,7 +125,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     if not name:
         raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
     if name not in panels:
-        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}")
+        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
     whole = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
     if not whole or any(seat not in judges for seat in seats):

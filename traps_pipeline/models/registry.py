@@ -4,7 +4,6 @@ entry, no code. Judges (`assets/judges.yaml`) are entries of the same form."""
 from __future__ import annotations
 
 import datetime
-import difflib
 import os
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -19,9 +18,10 @@ from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
-from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
+from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
 from traps_pipeline.models.prompts import FIELDS, fields_of
 from traps_pipeline.models.thinking import Marks, marks_of
 from traps_pipeline.protocol.cells import Evaluation
@@ -212,8 +212,11 @@ class ModelEntry(Entry):
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
     tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
     groups: Groups = Groups(family="own", access="own", input="own", group="own")
-    device: str | None = Field(default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1 or mps")
+    device: str | None = Field(
+        default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1, mps, or auto: all GPUs"
+    )
     mechanism: MechanismSpec | None = Field(default=None, description="of backend local: how it is looked into")
+    size: NetworkSize | None = Field(default=None, description="of backend local: for the hours of `traps plan`")
 
     @model_validator(mode="before")
     @classmethod
@@ -247,13 +250,15 @@ class ModelEntry(Entry):
     def _check_local(self) -> None:
         if self.backend == LOCAL:
             if self.device is None:
-                raise ValueError("device: backend local needs it (cpu, cuda, cuda:1 or mps); it is not chosen for you")
+                raise ValueError(
+                    "device: backend local needs it (cpu, cuda, cuda:1, mps or auto); it is not chosen for you"
+                )
             try:
                 self.local_params()
             except ValidationError as error:
                 raise ValueError(f"params: {explain(error)}") from error
-        elif self.device is not None or self.mechanism is not None:
-            raise ValueError("device, mechanism: only backend local has them")
+        elif (self.device, self.mechanism, self.size) != (None, None, None):
+            raise ValueError("device, mechanism, size: only backend local has them")
 
     def local_params(self) -> LocalParams:
         """`params` of backend local, checked. Raises pydantic's ValidationError."""
@@ -374,10 +379,8 @@ def get_model(model_id: str) -> ModelEntry:
     """The entry of that id. Raises TrapsError with ids that are like it."""
     models = load_models()
     if model_id not in models:
-        alike = difflib.get_close_matches(model_id, models, n=3, cutoff=0.4) or [*models][:3]
-        raise TrapsError(
-            f"unknown model {model_id!r:.60}; {MODELS_FILE} has {len(models)}, {', '.join(alike)} among them"
-        )
+        near = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
+        raise TrapsError(f"unknown model {model_id!r:.60}{near}")
     return models[model_id]
 
 

@@ -1,4 +1,4 @@
-"""Give back money that is booked for calls which never left, with the reason: `traps ledger release`.
+"""Give back money that is booked for calls which never left, with the reason: `traps study release-money`.
 
 A call in flight when its process died, and a failed one that may be billed, count as their worst case for good. A
 person who has compared the provider's bill says so here; the ledger keeps who said it, when and why.

@@ -1,6 +1,6 @@
 """People's labels as they are stored, and the tables made from them: labels of units of the study, and agreement.
 
-The pages of `traps annotate` append each label to `labels.jsonl`, one checked line a label; a later line of the same
+`traps people annotate` appends each label to `labels.jsonl`, one checked line a label; a later line of the same
 person about the same unit replaces the earlier one. Stages read that file alone.
 """
 
@@ -220,13 +220,13 @@ def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
 
 
 def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
-    """The labels of confabulation as `traps confabulation validate` reads them, from HUMAN_LABELS rows: of failures
+    """The labels of confabulation as `traps people validate` reads them, from HUMAN_LABELS rows: of failures
     that everybody who labelled any has labelled. Raises TrapsError where there are none."""
     own = labels.loc[labels["task"] == "confabulation"]
     everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()
     shared = own.loc[everybody.to_numpy(bool)]
     if shared.empty:
-        raise TrapsError("no failure is labelled by everybody yet; label some on the pages of `traps annotate`")
+        raise TrapsError("no failure is labelled by everybody yet; label some on the pages of `traps people annotate`")
     return [
         {"annotator": row["annotator"], "sample_id": row["unit"], **{axis: str(int(row[axis])) for axis in AXES}}
         for row in shared.sort_values(["annotator", "unit"]).to_dict("records")

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.own import Own, use
@@ -165,7 +166,8 @@ class Experiment(BaseModel):
 def _known(values: list[str], known: tuple[str, ...]) -> list[str]:
     unknown = [value for value in values if value not in known]
     if unknown or not values:
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(known)}")
+        near = did_you_mean(unknown[0], known) if unknown else ""
+        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(known)}{near}")
     return values
 
 
@@ -173,10 +175,10 @@ def load_experiment(name: str) -> Experiment:
     """An experiment by name (`demo`) or path (`my.yaml`). Raises TrapsError with the known names."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in EXPERIMENTS.glob("*.yaml")))
+        known = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))
         raise TrapsError(
-            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {known}, or give the path of a YAML "
-            "file"
+            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {', '.join(known)}, or give the path "
+            f"of a YAML file{did_you_mean(name, known)}"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     use(experiment.own, path)

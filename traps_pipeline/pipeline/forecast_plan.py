@@ -1,9 +1,9 @@
-"""`traps plan`: the calls that an experiment would make, with their tokens, dollars and minutes."""
+"""`traps plan`: the calls that an experiment would make, with their tokens, dollars and minutes, and GPU-hours."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,11 +12,14 @@ from traps_pipeline.benchmark.items import expected_items
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
+from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, passes_inside
+from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
+from traps_pipeline.mechanism.probing_versions import shown_inside
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
 from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of
 from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.registry import NETWORK, Entry, get_model
+from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.pipeline.experiment import Experiment
@@ -54,7 +57,7 @@ class Plan:
     before a run has made them; their calls are counted as new, which is an upper bound. forecasts: tokens,
     dollars and minutes of the new calls over the network, by model and judge. labels: calls to the confabulation judge;
     None if the study's panel has none. steered: answers of steered models and votes on them, by model. pairs: how many
-    there are, by dataset."""
+    there are, by dataset. local: what local models take of a card."""
 
     calls: Mapping[str, tuple[Count, Count]]
     uncertain: Sequence[str]
@@ -62,6 +65,7 @@ class Plan:
     labels: Count | None
     steered: Mapping[str, tuple[Count, Count]] = field(default_factory=dict)
     pairs: Mapping[str, int] = field(default_factory=dict)
+    local: Sequence[Cost] = ()
 
     @property
     def minutes(self) -> float:
@@ -71,12 +75,13 @@ class Plan:
         return minutes_of(models) + minutes_of(judges)
 
 
-def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study) -> Plan:
+def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
     """Count the calls of an experiment and forecast their cost; nothing is sent and nothing is made. study: the
-    workspace's, or the one that a new workspace would have, with the panel that judges."""
+    workspace's, or the one that a new workspace would have, with the panel that judges. card: one of CARDS."""
     panel = load_panel(study.panel)
     calls, uncertain = _count_calls(workspace, experiment, study)
     steered = _count_steered(workspace, experiment, study)
+    local = [*_local_costs(workspace, experiment, study, card, calls, steered)]
     votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // len(panel)) for judge in panel]
@@ -94,11 +99,11 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study)
     ]
     judge = load_protocol().judge(study.panel)
     if judge is None:
-        return Plan(calls, uncertain, forecasts, None, steered, pairs)
+        return Plan(calls, uncertain, forecasts, None, steered, pairs, local)
     labels = _count_labels(workspace, experiment, judge)
     taken = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
     forecasts.append(replace(taken, participant="confabulation labels"))
-    return Plan(calls, uncertain, forecasts, labels, steered, pairs)
+    return Plan(calls, uncertain, forecasts, labels, steered, pairs, local)
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
@@ -119,6 +124,37 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment, study: S
             answers.add(wanted, min(known[0], wanted))
             votes.add(ballots, min(known[1], ballots))
     return counts
+
+
+def _local_costs(
+    workspace: Workspace | None,
+    experiment: Experiment,
+    study: Study,
+    card: str,
+    calls: Mapping[str, tuple[Count, Count]],
+    steered: Mapping[str, tuple[Count, Count]],
+) -> Iterator[Cost]:
+    """What local models take of a card: their new answers; and, as nothing tells how much of it is known, all passes
+    of states and patches of a study that has no states of the model yet."""
+    settings, scenarios = experiment.mechanism, load_scenarios(study).values()
+    taxonomies = Counter(datasets_of_category(scenario.category)[0] for scenario in scenarios)
+    for model in dict.fromkeys([*calls, *(settings.models if settings else ())]):
+        entry = get_model(model)
+        if entry.backend != LOCAL or entry.media is None:
+            continue
+        tokens = min(entry.expected_completion_tokens, entry.local_params().max_new_tokens)
+        work = [(entry, Work("answers", calls[model][0].new, tokens), entry.local_params())] if model in calls else []
+        if settings and model in settings.models:
+            inside, params = shown_inside(entry, settings), entry.inside_params()
+            if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
+                work += [(inside, one, params) for one in passes_inside(settings, experiment.datasets, taxonomies)]
+            if settings.steering and model in steered:
+                most = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
+                work.append((inside, Work("steered answers", steered[model][0].new, most), params))
+        for shown, one, params in work:
+            assert shown.media is not None, "local entries have media"
+            if one.passes:
+                yield cost_of(shown, shown.media, one, CARDS[card], quantised=params.quantisation == "nf4")
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:

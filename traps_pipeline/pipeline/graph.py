@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.pipeline.partitioning import EVERY, SAME, KeyMapping, Scheme
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
@@ -155,8 +156,8 @@ class Graph:
     def __getitem__(self, name: str) -> Stage:
         one = self.declared.get(name)
         if not isinstance(one, Stage):
-            known = ", ".join(stage.name for stage in self.stages)
-            raise TrapsError(f"no stage {name!r}; choose from {known}")
+            known = [stage.name for stage in self.stages]
+            raise TrapsError(f"no stage {name!r}{did_you_mean(name, known) or '; choose from ' + ', '.join(known)}")
         return one
 
     def source(self, name: str) -> Source | None:

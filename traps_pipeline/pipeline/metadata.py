@@ -16,7 +16,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 PREVIEWED = 5  # rows
-RANKED = ("pecs", "pecs_r")  # columns by which the rows of a table are better or worse
+RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
 
 def visible_metadata(value: Any) -> Any:

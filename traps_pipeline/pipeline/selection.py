@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.pipeline.graph import name_of, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import Wanted
@@ -28,7 +29,8 @@ def stages_until(until: str | None) -> set[str]:
         return {stage.name for stage in graph.stages}
     known = [stage.name for stage in graph.stages]
     if unknown := [name for name in until.split(",") if name not in known]:
-        raise TrapsError(f"--until {', '.join(unknown)}: no such stage; choose from {', '.join(known)}")
+        near = did_you_mean(unknown[0], known) or f"; choose from {', '.join(known)}"
+        raise TrapsError(f"--until {', '.join(unknown)}: no such stage{near}")
     return graph.above(until.split(","))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
@@ -22,17 +23,17 @@ _OF_ANSWER = ("item_id", "text", "error", "outcome")
 _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "rationale", "invalid_reason")
 
 
-def why(workspace: Workspace, item_id: str) -> Iterator[str]:
-    """For every evaluation that has asked the item: whether its answer is still valid, or which component of the key
-    changed, with the answer and its votes. Before them the item's question and clip. Raises TrapsError for an unknown
-    item."""
+def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
+    """Return an item's question and clip (if it is still in the benchmark), and for every evaluation that has asked it
+    whether its answer is still valid or which component of the key changed, with the answer and its votes. Raises
+    TrapsError for an unknown item."""
     dataset = item_id.split(":")[0]
     current = _current_item(workspace, dataset, item_id)
-    n_asked = 0
+    explanation: dict[str, Any] = {"item": item_id, "evaluations": []}
     if current is not None:
-        yield f"question: {current['question']}"
-        yield f"ground truth: {current['ground_truth'] if current['side'] == 'control' else 'none, it is void'}"
-        yield f"clip: {workspace.resolve(current['clip'])}"
+        truth = current["ground_truth"] if current["side"] == "control" else "none, it is void"
+        clip = str(workspace.resolve(current["clip"]))
+        explanation |= {"question": current["question"], "ground_truth": truth, "clip": clip}
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
@@ -40,27 +41,44 @@ def why(workspace: Workspace, item_id: str) -> Iterator[str]:
                 rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
                 if not rows:
                     continue
-                n_asked += 1
                 wanted = answer_request(workspace, entry, current, evaluation) if current else None
-                yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
-                yield from _judged(workspace, Cell(dataset, evaluation), item_id)
-    if current is None and not n_asked:
-        raise TrapsError(
-            f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
-        )
-    if not n_asked:
+                cell = Cell(dataset, evaluation)
+                explanation["evaluations"].append(
+                    {
+                        "evaluation": evaluation.key,
+                        "state": _state(rows, wanted.components if wanted else None),
+                        "answers": _rows_of(workspace, RESPONSES, _OF_ANSWER, cell, item_id),
+                        "votes": _rows_of(workspace, VOTES, _OF_VOTE, cell, item_id),
+                    }
+                )
+    if current is None and not explanation["evaluations"]:
+        raise TrapsError(_unknown(workspace, item_id))
+    return explanation
+
+
+def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
+    """Yield an explanation as lines of text."""
+    if "question" in explanation:
+        yield f"question: {explanation['question']}"
+        yield f"ground truth: {explanation['ground_truth']}"
+        yield f"clip: {explanation['clip']}"
+    for each in explanation["evaluations"]:
+        yield f"{each['evaluation']}: {each['state']}"
+        for answer in each["answers"]:
+            yield f"    {answer['outcome']}: {_short(answer['text']) if answer['text'] else answer['error'] or ''}"
+        for vote in each["votes"]:
+            decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
+            word = "invalid" if not vote["valid"] else "yes" if decision else "no"
+            yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
+    if not explanation["evaluations"]:
         yield "no model has been asked this item"
 
 
-def _judged(workspace: Workspace, cell: Cell, item_id: str) -> Iterator[str]:
-    """The answer to an item as its table has it, and the votes on it."""
-    for answer in _rows_of(workspace, RESPONSES, _OF_ANSWER, cell, item_id):
-        said = _short(answer["text"]) if answer["text"] else answer["error"] or ""
-        yield f"    {answer['outcome']}: {said}"
-    for vote in _rows_of(workspace, VOTES, _OF_VOTE, cell, item_id):
-        decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
-        word = "invalid" if not vote["valid"] else "yes" if decision else "no"
-        yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
+def _unknown(workspace: Workspace, item_id: str) -> str:
+    """Return why an item is unknown, with the nearest one."""
+    known = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    form = "; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
+    return f"item {item_id!r} is unknown{did_you_mean(item_id, known) or form}"
 
 
 def _rows_of(
@@ -82,7 +100,7 @@ def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str,
     return next((item for item in items if item["item_id"] == item_id), None)
 
 
-def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
+def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
     newest = max(rows, key=lambda row: row["created_at"])
     if wanted is None:
         return f"asked {len(rows)} times; the item is no longer in the benchmark, its answers stay in the ledger"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from traps_pipeline.pipeline.lineage import Lineage
@@ -13,19 +12,34 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """The partitions of a stage: the number of fresh ones, the stale ones with reasons, the number of missing ones."""
+    """The partitions of a stage: the number of fresh ones, the stale ones with reasons, the missing ones. A stage
+    without partitions has one, of its own name."""
 
     stage: str
     fresh: int
     stale: Mapping[str, tuple[str, ...]]
-    missing: int
+    missing: Sequence[str]
+
+    def by_reason(self) -> Mapping[str, list[str]]:
+        """Return the partitions that are not fresh, by their reasons."""
+        groups = dict[str, list[str]]()
+        for key, reasons in self.stale.items():
+            groups.setdefault("; ".join(reasons), []).append(key)
+        return groups | ({"not made yet": [*self.missing]} if self.missing else {})
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """The status of every stage, over the partitions that the study wants, or that one of its experiments wants."""
+    """Yield the status of every stage, over the partitions that the study wants, or one of its experiments."""
     wanted = Wanted(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(wanted)}
         stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
-        kinds = Counter(status.kind for status in statuses.values())
-        yield StageStatus(stage.name, kinds["fresh"], stale, kinds["missing"])
+        missing = [key for key, status in statuses.items() if status.kind == "missing"]
+        yield StageStatus(stage.name, len(statuses) - len(stale) - len(missing), stale, missing)
+
+
+def failing_checks(workspace: Workspace) -> Iterator[tuple[str, str, str, str]]:
+    """Yield each check that does not pass: its name, stage, partition and what it says."""
+    for file in workspace.store.below(workspace.root / "checks", "*/*/*.json"):
+        stage, check = file.parts[-3:-1]
+        yield check, stage, file.stem, workspace.store.here(file).read_text(encoding="utf-8")[:200]

@@ -121,6 +121,11 @@ class Wanted:
         return self._inside is not None and (self._inside[1] is None or self._inside[1].patching is not None)
 
     @cached_property
+    def reads_sentences(self) -> bool:
+        """Whether the log-probability of abstentions is read."""
+        return self._inside is not None and (self._inside[1] is None or bool(self._inside[1].sentences))
+
+    @cached_property
     def probed(self) -> list[str]:
         """Datasets whose hidden states are extracted."""
         datasets = self._inside[0] if self._inside else []

@@ -23,12 +23,13 @@ DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
 LONG = {short: dataset for dataset, short in SHORT.items()}
 # Datasets beside the pairs, each of which takes one shortcut away (docs/arms.md). No part of PECS; asked on request.
-ANSWERABLE_ARMS = ("decoy", "removed", "late_panel", "length_matched", "predictable_cut", "twin_control")
-VOID_ARMS = ("frame_out", "held_void")
-PAIRED_ARMS = ("choices_swapped",)  # has controls and voids
-ARMS = (*ANSWERABLE_ARMS, *VOID_ARMS, *PAIRED_ARMS)
+CROSSED = "crossed"  # has controls and voids; all other arms have controls alone
+TWIN = "twin_control"
+INFERENCE_ARMS = ("late_panel", "predictable_cut")  # the outcome is not shown, but can be inferred
+ROBUST_ARMS = ("decoy", "removed", "length_matched", TWIN, CROSSED)
+ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
 # Datasets that change one thing of the pairs, step by step, for what the paper supposes and did not measure
-# (docs/hypotheses.md). No part of PECS or of PECS-R; asked on request.
+# (docs/hypotheses.md). No part of PECS or of the arms' figures; asked on request.
 LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
 PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_large", "panel_alpha_95")  # still voids
 PANEL_DOSES = ("panel_alpha_80", "panel_alpha_50")  # the panel lets the outcome through: no voids
@@ -37,8 +38,8 @@ FRAMINGS = ("frames_later", "frames_few", "frames_all")
 VARIATIONS = (*LABEL_DOSES, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
 BESIDE = (*ARMS, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
-    **dict.fromkeys(("decoy", "removed", "late_panel", "frame_out", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
-    **dict.fromkeys(("length_matched", "predictable_cut", "held_void"), "chaotic"),
+    **dict.fromkeys(("decoy", "removed", "late_panel", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
+    **dict.fromkeys(("length_matched", "predictable_cut"), "chaotic"),
 }
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
 TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each side's frames with the other's times
@@ -99,5 +100,5 @@ def dataset_of(item_id: str) -> str:
 
 def sides_of(dataset: str) -> tuple[str, ...]:
     """The sides that a dataset, an arm or a variation asks of each scenario."""
-    controls, voids = (*ANSWERABLE_ARMS, *PANEL_DOSES), (*VOID_ARMS, *PANEL_LOOKS)
-    return {**dict.fromkeys(controls, ("control",)), **dict.fromkeys(voids, ("void",))}.get(dataset, SIDES)
+    controls = {*ARMS, *PANEL_DOSES} - {CROSSED}
+    return ("control",) if dataset in controls else ("void",) if dataset in PANEL_LOOKS else SIDES

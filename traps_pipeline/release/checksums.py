@@ -36,7 +36,9 @@ def read_checksums(folder: Path) -> dict[str, str]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise TrapsError(f"{path}: cannot be read ({error}); give the folder that `traps release` wrote") from error
+        raise TrapsError(
+            f"{path}: cannot be read ({error}); give the folder that `traps publish release` wrote"
+        ) from error
     found: dict[str, str] = {}
     for number, line in enumerate(lines, start=1):
         if line.startswith("#"):

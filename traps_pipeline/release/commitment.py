@@ -68,7 +68,7 @@ def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
 
 
 def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
-    """Commit to a benchmark that `traps sample` drew: write what is published, and what is kept (readable by its owner
+    """Commit to a benchmark of `traps benchmark sample`: write what is public and what is kept (readable by its owner
     alone). Raises TrapsError where the folder is none, or of several seeds, and where either file is there already."""
     for path in (commitment, reveal):
         if path.exists():
@@ -76,7 +76,9 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     specs, tallies = load_released(benchmark / "released"), load_tallies(benchmark / "released")
     seeds = {tally.seed for tally in tallies.values()}
     if len(seeds) != 1 or {spec.family for spec in specs.values()} != {*tallies}:
-        raise TrapsError(f"{benchmark}: is not one draw of one seed; draw one with `traps sample` into a new folder")
+        raise TrapsError(
+            f"{benchmark}: is not one draw of one seed; draw one with `traps benchmark sample` into a new folder"
+        )
     kept = Reveal(seed=seeds.pop(), nonce=secrets.token_hex(32))
     release, draws = load_release(benchmark / "benchmark.yaml"), {n: t.wanted for n, t in sorted(tallies.items())}
     published = Commitment(
@@ -112,14 +114,16 @@ def _read(kind: type[Any], path: Path) -> Any:
     except ValidationError as error:
         raise TrapsError(f"{path}: is no {kind.__name__.lower()} ({explain(error)}); get the file again") from error
     except OSError as error:
-        raise TrapsError(f"{path}: cannot be read ({error.strerror}); name a file of `traps commit`") from error
+        raise TrapsError(
+            f"{path}: cannot be read ({error.strerror}); name a file of `traps benchmark commit`"
+        ) from error
 
 
 # --- verification -----------------------------------------------------------------------------------------------------
 
 
 def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
-    """The records of a revealed benchmark: of the folder that `traps sample` wrote, or of a released folder. Raises
+    """The records of a revealed benchmark: a folder of `traps benchmark sample`, or a released folder. Raises
     TrapsError, also for a trajectory that is not its record's."""
     from traps_pipeline.benchmark.specs import spec_of
 

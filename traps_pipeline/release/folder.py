@@ -1,4 +1,4 @@
-"""`traps release`: the folder that is published, the same bytes whenever it is made from the same study."""
+"""`traps publish release`: the folder that is published, the same bytes whenever it is made from the same study."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ PLACES: Mapping[str, str] = {
 class Options:
     """How a folder is released. arms: beside the pairs. held_out: the file of the key under which items get opaque
     names, and beside which their answers are written; None to publish the answers. date: of the publication,
-    YYYY-MM-DD. commitment: a file that `traps commit` wrote."""
+    YYYY-MM-DD. commitment: a file that `traps benchmark commit` wrote."""
 
     arms: Sequence[str] = ()
     anonymous: bool = False

@@ -168,13 +168,15 @@ def read_submission(path: Path) -> Submission:
         with zipfile.ZipFile(path) as archive:
             content = _members(path, archive)
     except OSError as error:
-        raise TrapsError(f"{path}: cannot be read ({error.strerror}); name a file that `traps submit` wrote") from error
+        raise TrapsError(
+            f"{path}: cannot be read ({error.strerror}); name a file that `traps publish submit` wrote"
+        ) from error
     except _NO_ZIP as error:
         raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
     try:
         about = About.model_validate_json(content[ABOUT])
     except ValidationError as error:
-        raise TrapsError(f"{path}: {ABOUT}: {explain(error)}; pack it again with `traps submit`") from error
+        raise TrapsError(f"{path}: {ABOUT}: {explain(error)}; pack it again with `traps publish submit`") from error
     altered = [file for file in TABLES if about.files.get(file) != hashlib.sha256(content[file]).hexdigest()]
     frames = {file: _frame(path, file, content[file]) for file in TABLES}
     return Submission(path, about, frames, tuple(altered))
@@ -188,7 +190,9 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
     for entry in entries:
         # Stored, so that no entry can be larger than the file; Parquet compresses its own columns.
         if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-            raise TrapsError(f"{path}: {entry.filename} is compressed or encrypted; pack it with `traps submit`")
+            raise TrapsError(
+                f"{path}: {entry.filename} is compressed or encrypted; pack it with `traps publish submit`"
+            )
         if entry.filename == ABOUT and entry.file_size > MOST_ABOUT_BYTES:
             raise TrapsError(f"{path}: {ABOUT} has {entry.file_size} bytes, at most {MOST_ABOUT_BYTES} are read")
     return {entry.filename: archive.read(entry) for entry in entries}

@@ -1,6 +1,6 @@
 """Every table and figure by name: the function that makes it from `Results`, and the stages it reads (docs/spec.md 10).
 
-A new table or figure is an entry here. Its asset, its staleness and its place on the report page and in `traps export`
+A new table or figure is an entry here. Its asset, staleness and place on the report page and in `traps results export`
 follow from the entry.
 """
 
@@ -288,7 +288,7 @@ FIGURES: tuple[FigureReport, ...] = (
         "states_and_output",
         "States against output, item by item",
         expression_figures.states_and_output,
-        ("item_scores",),
+        ("item_scores", "sentences", "probe_baselines"),
         published=False,
         finding=findings.states_and_output,
     ),
@@ -352,7 +352,7 @@ def folder(kind: str, results: Results) -> str:
 
 
 def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
-    """The files that a workspace keeps: all files of a table, the PNG of a figure; `traps export` writes the rest."""
+    """The files that a workspace keeps: all of a table, the PNG of a figure; `traps results export` writes the rest."""
     return report.files(results) if isinstance(report, TableReport) else report.picture(results)
 
 

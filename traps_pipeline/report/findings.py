@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ALPHA = 0.05 + 1e-9
+_SCORES = {"states": "states", "margin": "first token", "sentences": "whole abstentions"}
 _CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
 
 
@@ -39,11 +40,13 @@ def states_and_output(results: Results) -> str:
         encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
         wrongly = int((controls["own"] > 0).sum())
         areas = [orders(part) for _, part in of.groupby("dataset", sort=False, observed=True)]
-        states, output = (sum(area) / len(areas) for area in zip(*areas, strict=True))
+        means = {
+            name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
+        }
         sentences.append(
             f"{model} answered {len(voids)} voids under standard: its states put {encoded} of them among voids (and "
-            f"{wrongly} of {len(controls)} controls), its output {expressed}; as an order of the sides, the AUROC of "
-            f"states is {states:.2f} and of output {output:.2f} (mean of datasets)."
+            f"{wrongly} of {len(controls)} controls), its output {expressed}; as orders of the sides (AUROC, mean of "
+            f"datasets): {', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
     return " ".join(sentences)
 

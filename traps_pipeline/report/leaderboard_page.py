@@ -44,6 +44,7 @@ from traps_pipeline.report.writing import (
     Column,
     PrintedTable,
     fraction,
+    percent,
     table_markdown,
     table_text,
 )
@@ -65,7 +66,11 @@ OPTIONAL = {
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
-ROBUST_COLUMNS = (Column("pecs_r", "PECS-R", "range", group=True), Column("gap", "gap", "range"))
+ROBUST_COLUMNS = (
+    Column("conjunction", "Conjunction %", "range", group=True),
+    Column("robust", "Robust", "range"),
+    Column("inference_acc", "Inferred %", "range"),
+)
 LEGEND = {
     "Acc": "share of control items answered correctly",
     "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
@@ -235,30 +240,23 @@ def _leaderboard(
 
 
 def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
-    """The rows with PECS-R and gap as printed; PECS-R has the number of its arms unless these are all."""
+    """The rows with ROBUST_COLUMNS as printed."""
     found = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
-    return rows.assign(
-        pecs_r=[fraction(row["pecs_r"]) + _of_arms(row) if row else NOT_RUN for row in found],
-        gap=[fraction(row["gap"]) if row else NOT_RUN for row in found],
-    )
-
-
-def _of_arms(row: Mapping[str, Any]) -> str:
-    return f" ({len(row['arms'])} of {len(ARMS)} arms)" if len(row["arms"]) < len(ARMS) else ""
+    printed = {"conjunction": percent, "robust": fraction, "inference_acc": percent}
+    return rows.assign(**{name: [as_(row[name]) if row else NOT_RUN for row in found] for name, as_ in printed.items()})
 
 
 def _notes_on_arms(beside: Robust) -> list[str]:
-    """Notes that name the arms of each PECS-R, and the reasons why there is no gap."""
+    """Notes that name the arms of each entry, and the reasons why pairs and arms are not joined."""
     entries: dict[tuple[str, ...], list[str]] = {}
     for (model, regime), row in beside.items():
         entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
     notes = [
-        f"PECS-R{' of ' + ', '.join(names) if len(entries) > 1 else ''} is over {len(arms)} of {len(ARMS)} arms: "
-        + ", ".join(arms)
+        f"{', '.join(names) if len(entries) > 1 else 'all'} over {len(arms)} of {len(ARMS)} arms: {', '.join(arms)}"
         for arms, names in entries.items()
     ]
     refused = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no gap: {why}" for why in refused)]
+    return [*notes, *(f"no conjunction and no robust figure: {why}" for why in refused)]
 
 
 def _trace(row: Mapping[str, Any], field: str) -> Behind | None:

@@ -1,4 +1,4 @@
-"""The report page from all its parts, and `traps export`, which writes all tables, figures and pages to one folder."""
+"""The report page of all its parts and `traps results export`, which writes all tables, figures, pages to a folder."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from traps_pipeline.mechanism.control_rows import (
     PATCHING,
     PROBE_BASELINES,
     RISK_COVERAGE,
+    SENTENCES,
     STEERING_NULLS,
     STEERING_PECS,
 )
@@ -150,6 +151,7 @@ class Results:
         "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
     )
     lens = Made(table=LENS)
+    sentences = Made(table=SENTENCES)
     item_scores = Made("ITEM_SCORES rows under PROBE_PROMPT.", table=ITEM_SCORES)
     steering_families = Made(
         "Rows of `mechanism.effects.family_asymmetry`.",

@@ -16,11 +16,13 @@ TITLES = {
 # Neither arms nor variations enter a figure of the pairs.
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
-# What the columns of a leaderboard with arms mean (docs/scoring.md, "PECS-R and the gap").
+# What the columns of a leaderboard with arms mean (docs/scoring.md, "Beyond PECS").
 ROBUST_TERMS = {
-    "PECS-R": "PECS over the pairs and the arms, which take shortcuts away; kinds of items have equal weight. Entries "
-    "over different arms are not compared",
-    "gap": "PECS of the runs that PECS-R uses, minus PECS-R: the part of PECS that may come from shortcuts",
+    "Conjunction %": "share of scenarios with control, twin, void and both crossed questions right; 0 for every rule "
+    "that abstains for the clip alone or for the question alone",
+    "Robust": "PECS over kinds: the pairs and each arm that takes a shortcut away. Entries over different arms are not "
+    "compared",
+    "Inferred %": "share of the items of late_panel and predictable_cut answered correctly: their outcome is not shown",
 }
 # The side of the items that a share counts.
 SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}

@@ -1,4 +1,4 @@
-"""Published values that follow from other published values, recomputed and compared (`traps audit`).
+"""Published values that follow from other published values, recomputed and compared (`traps results audit`).
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
 possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or

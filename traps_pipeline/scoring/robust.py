@@ -1,8 +1,7 @@
-"""PECS-R: PECS once shortcuts are taken away, and the gap between the two (docs/scoring.md, "PECS-R and the gap").
+"""What is left of PECS when abstaining must follow from clip and question together (docs/scoring.md, "Beyond PECS").
 
-A kind is a set of items that are all answerable, or all void, for one reason. The controls of the four datasets are one
-kind, and their voids another; an arm adds one kind for each side that it has. Kinds have equal weight, so that a cue
-that works only in the pairs, which have most items, does not give a high score.
+The conjunction asks, of each scenario, for everything at once. The robust figure is PECS over kinds: sets of items that
+are all answerable, or all void, for one reason. Arms whose outcome must be inferred enter neither.
 """
 
 from __future__ import annotations
@@ -14,11 +13,12 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import (
-    ANSWERABLE_ARMS,
     ARMS,
+    CROSSED,
     DATASETS,
-    PAIRED_ARMS,
-    VOID_ARMS,
+    INFERENCE_ARMS,
+    ROBUST_ARMS,
+    TWIN,
     datasets_of_category,
     is_ill_posed,
 )
@@ -32,16 +32,18 @@ from traps_pipeline.scoring.bootstrap import (
     ends_of_pecs,
     figures_of,
     interval,
+    resampled_sums,
     run_sums,
+    shares_of,
+    with_unseen,
 )
-from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs
 from traps_pipeline.scoring.score_rows import ROBUST
 
-TWIN = "twin_control"
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
-WITH_CONTROLS, WITH_VOIDS = (*ANSWERABLE_ARMS, *PAIRED_ARMS), (*VOID_ARMS, *PAIRED_ARMS)
-FIGURES = ("acc_r", "abs_rec_r", "false_abs_r", "pecs", "pecs_r", "gap")
-INTERVALS = {"pecs_r": (0.0, 1.0), "gap": (-1.0, 1.0)}  # with the limits of each figure
+CONJUNCTION = ("control", "void", f"{TWIN} control", f"{CROSSED} control", f"{CROSSED} void")  # of one scenario
+FULL_KIND = 30  # items; a kind with fewer weighs less, in proportion
+WITH_INTERVAL = ("robust", "conjunction")
 _ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
 
@@ -88,61 +90,89 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
 
 def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
     """The columns of an entry's ROBUST row except model, regime and arms."""
-    figures = {cell: figures_of(sums, in_mean=True) for cell, sums in run_sums(items, drawn, named).items()}
-    runs = sorted({run for _, run in figures})
-    by_run = np.stack([run_figures({d: figures[d, run] for d in (*DATASETS, *arms)}, arms) for run in runs])
-    twins = [_twins(items.loc[items["run"] == run]) for run in runs] if TWIN in arms else []
-    observed = by_run[:, 1, :, 0]  # (runs, FIGURES)
-    gap, pecs, pecs_r = (FIGURES.index(name) for name in ("gap", "pecs", "pecs_r"))
-    observed[:, gap] = observed[:, pecs] - observed[:, pecs_r]
+    runs = dict(list(items.groupby("run", sort=True)))
+    sums = run_sums(items, drawn, named)
+    kinds = (*DATASETS, *(arm for arm in arms if arm in ROBUST_ARMS))
+    conjunctions = [_conjunction(rows, drawn, f"{named}|conjunction") for rows in runs.values()]
+    figures = {
+        "robust": [
+            robust_ends(
+                {kind: figures_of(sums[kind, cast(int, run)], in_mean=True) for kind in kinds},
+                {kind: rows.loc[rows["dataset"] == kind, "scenario_id"].nunique() for kind in kinds},
+            )
+            for run, rows in runs.items()
+        ],
+        "conjunction": [ends for ends, _ in conjunctions],
+    }
     row: dict[str, Any] = {
         "n_runs": len(runs),
-        "n_items": max(rows["item_id"].nunique() for _, rows in items.groupby("run")),
+        "n_items": max(rows["item_id"].nunique() for rows in runs.values()),
         "n_missing": _missing(items),
+        "n_conjunction": max(n for _, n in conjunctions),
         "epoch": joined_epochs(items["epoch"]),
         "panel": joined_epochs(items["panel"]),
         "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
         "refused": _refusal(items),
-        "n_twins": max((n for _, n in twins), default=0),
     }
-    row |= dict(zip(FIGURES, observed.mean(axis=0), strict=True))
-    row |= {f"{name}_std": value for name, value in zip(FIGURES, observed.std(axis=0), strict=True)}
-    shares = [share for share, _ in twins]
-    row |= {"twin_accuracy": None, "twin_accuracy_std": None}
-    if shares:
-        row |= {"twin_accuracy": np.mean(shares), "twin_accuracy_std": np.std(shares)}
-    ends = by_run.mean(axis=0)[..., 1:]
-    for name, limits in INTERVALS.items():
-        bounds = interval(ends[:, FIGURES.index(name)], row[name], limits)
-        row |= dict(zip((f"{name}_ci_low", f"{name}_ci_high"), bounds, strict=True))
-    if row["refused"]:
-        row |= {name: None for name in row if name.startswith("gap")}
+    for name, by_run in figures.items():
+        ends = np.mean(by_run, axis=0)
+        values = ends[0, 0], *interval(ends[:, 1:], ends[0, 0], (0.0, 1.0))
+        columns = (name, f"{name}_ci_low", f"{name}_ci_high")
+        row |= dict.fromkeys(columns) if row["refused"] else dict(zip(columns, values, strict=True))
+    inferred = items.loc[items["dataset"].isin(INFERENCE_ARMS)].groupby("run")[COUNTS].sum().reindex(list(runs))
+    for name, count in (("inference_acc", "correct"), ("inference_abstains", "false_abs")):
+        row[name] = (inferred[count] / inferred[f"{count}_of"].replace(0, np.nan)).mean(skipna=False)
     return row
 
 
-def run_figures(cells: Mapping[str, np.ndarray], arms: Sequence[str]) -> np.ndarray:
-    """The ends of FIGURES of one run, (2, FIGURES, draws), from those of RESAMPLED, (2, RESAMPLED, draws), of its
-    datasets and arms."""
+def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
+    """Return the ends of the robust figure of one run, (2, draws); NaN where it has no robust arm.
 
-    def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
-        at = RESAMPLED.index(figure)
-        return np.mean([pairs[:, at], *(cells[arm][:, at] for arm in arms if arm in of)], axis=0)
-
+    cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: how many
+    each of them has.
+    """
+    arms = {arm: min(1.0, scenarios[arm] / FULL_KIND) for arm in cells if arm in ROBUST_ARMS}
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
-    acc, false_abs = (mean_over_kinds(figure, WITH_CONTROLS) for figure in ("acc", "false_abs"))
-    abs_rec, pecs = mean_over_kinds("abs_rec", WITH_VOIDS), pairs[:, RESAMPLED.index("pecs")]
-    pecs_r = ends_of_pecs(acc, difference(abs_rec, false_abs))
-    return np.stack([acc, abs_rec, false_abs, pecs, pecs_r, difference(pecs, pecs_r)], axis=1)
+
+    def mean_over_kinds(figure: str, weights: Mapping[str, float]) -> np.ndarray:
+        at = RESAMPLED.index(figure)
+        kinds = [pairs[:, at], *(cells[arm][:, at] for arm in weights)]
+        return np.average(kinds, axis=0, weights=[1.0, *weights.values()])
+
+    acc, false_abs = (mean_over_kinds(figure, arms) for figure in ("acc", "false_abs"))
+    abs_rec = mean_over_kinds("abs_rec", {arm: weight for arm, weight in arms.items() if arm == CROSSED})
+    ends = ends_of_pecs(acc, difference(abs_rec, false_abs))
+    return ends if arms else np.full_like(ends, np.nan)
 
 
-def _twins(items: pd.DataFrame) -> tuple[float, int]:
-    """In one run, among the scenarios in which control and twin control are both decided: the share in which both are
-    correct (NaN if there is none), and their number."""
-    controls = items.loc[(items["side"] == "control") & items["correct_of"].eq(1)].set_index("scenario_id")
-    own = controls.loc[controls["dataset"].isin(VISUAL), "correct"]
-    twin = controls.loc[controls["dataset"] == TWIN, "correct"]
-    worlds = pd.concat([own, twin], axis=1, join="inner").to_numpy(float)
-    return (float(worlds.min(axis=1).mean()) if len(worlds) else float("nan")), len(worlds)
+def conjunction_of(items: pd.DataFrame) -> pd.Series:
+    """Return, of each scenario that is asked all of CONJUNCTION in one run, whether every decision is right (1 or 0).
+
+    items: VERDICTS rows of one run with COUNTS. NaN where a decision was not made and none is wrong.
+    """
+    control, dataset = items["side"].eq("control"), items["dataset"]
+    right = items["correct"].where(control, items["abs_rec"]).astype(float)
+    right = right.where(items["correct_of"].where(control, items["abs_rec_of"]) > 0)
+    decision = items["side"].where(dataset.isin(VISUAL), dataset + " " + items["side"])
+    asked = pd.DataFrame({"scenario": items["scenario_id"], "decision": decision, "right": right})
+    asked = asked.loc[decision.isin(CONJUNCTION)]
+    decisions = asked.groupby("scenario")["decision"].nunique()
+    asked = asked.loc[asked["scenario"].isin(decisions.index[decisions == len(CONJUNCTION)])]
+    worst, undecided = asked.groupby("scenario")["right"].min(), asked["right"].isna().groupby(asked["scenario"]).any()
+    return worst.where((worst == 0) | ~undecided)
+
+
+def _conjunction(items: pd.DataFrame, drawn: Drawn, named: str) -> tuple[np.ndarray, int]:
+    """Return the ends of the share of decided scenarios that `conjunction_of` finds right, (2, draws), and their
+    number."""
+    decided = conjunction_of(items).dropna()
+    sums = np.zeros((1, 2, 1 + drawn.resamples))
+    for scenarios, weights in drawn.scenarios.values():
+        own = decided.reindex(scenarios)
+        counts = np.stack([own.fillna(0.0), own.notna()], axis=1).astype(float)
+        sums += resampled_sums(weights, counts[:, None])
+    ends = shares_of(with_unseen(sums, np.array([[len(decided)]]), drawn.unseen(named, 1)))
+    return ends[:, 0, 0], len(decided)
 
 
 def _missing(items: pd.DataFrame) -> int:
@@ -153,24 +183,23 @@ def _missing(items: pd.DataFrame) -> int:
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Why there is no gap between pairs and arms: they were answered in different campaigns (docs/spec.md 9.2), or
-    judged by different panels."""
+    """Why no figure joins pairs and arms: they were answered in different campaigns (docs/spec.md 9.2), or judged by
+    different panels."""
     of_arms = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
-        return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one gap"
+        return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
     pairs, arms = (joined_epochs(items.loc[chosen, "epoch"]) for chosen in (~of_arms, of_arms))
     if pairs == arms and "+" not in pairs:
         return None
-    return f"pairs of epoch {pairs}, arms of epoch {arms}; figures of different epochs are never put in one gap"
+    return f"pairs of epoch {pairs}, arms of epoch {arms}; figures of different epochs are never put in one figure"
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """How many ROBUST rows break their definition: a PECS-R or share outside [0, 1], an interval out of order, a gap
-    that is not PECS - PECS-R. Null is not wrong."""
-    shares = table[["acc_r", "abs_rec_r", "false_abs_r", "pecs_r", "twin_accuracy"]].to_numpy(float)
+    """How many ROBUST rows break their definition: a figure outside [0, 1] or outside its interval. Null is not
+    wrong."""
+    shares = table[[*WITH_INTERVAL, "inference_acc", "inference_abstains"]].to_numpy(float)
     wrong = ((shares < 0) | (shares > 1)).any(axis=1)
-    for name in INTERVALS:
-        low, high = (table[f"{name}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
-        wrong |= (low > high) | (low < (0 if name == "pecs_r" else -1)) | (high > 1)
-    pecs, pecs_r, gap = (table[name].to_numpy(float) for name in ("pecs", "pecs_r", "gap"))
-    return int((wrong | (np.abs(gap - (pecs - pecs_r)) > 1e-12)).sum())
+    for name in WITH_INTERVAL:
+        low, value, high = (table[f"{name}{end}"].to_numpy(float) for end in ("_ci_low", "", "_ci_high"))
+        wrong |= (low > value) | (value > high) | (low < 0) | (high > 1)
+    return int(wrong.sum())

@@ -181,6 +181,7 @@ class LeaderboardRow:
     pecs_low: Annotated[float, "mean over runs: pecs if every missing decision were the worst for the model"]
     pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec, mean over runs"]
+    pecs_by_family: Annotated[float | None, "pecs of shares that are means over families, mean over runs"]
     panel: shared.Panels
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
@@ -191,7 +192,7 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 
 @dataclass(frozen=True, kw_only=True)
 class RobustRow:
-    """A model under a regime when shortcuts are taken away: over the four datasets and the arms that it was asked."""
+    """A model under a regime when clip and question must be read together: the four datasets with the arms asked."""
 
     model: shared.Model
     regime: shared.Regime
@@ -199,32 +200,28 @@ class RobustRow:
     n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
     n_items: Annotated[int, "items per run, of the four datasets and the arms"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
-    acc_r: Annotated[float | None, "mean over runs of Acc over answerable kinds, with equal weights"]
-    acc_r_std: Deviation
-    abs_rec_r: Annotated[float | None, "mean over runs of AbsRec over void kinds, with equal weights"]
-    abs_rec_r_std: Deviation
-    false_abs_r: Annotated[float | None, "mean over runs of FalseAbs over answerable kinds, with equal weights"]
-    false_abs_r_std: Deviation
-    pecs: Annotated[float | None, "mean over these runs of the overall PECS"]
-    pecs_std: Deviation
-    pecs_r: Annotated[float | None, "mean over runs of acc_r x max(0, abs_rec_r - false_abs_r), per run"]
-    pecs_r_std: Deviation
-    pecs_r_ci_low: Bootstrap
-    pecs_r_ci_high: Bootstrap
-    gap: Annotated[float | None, "pecs - pecs_r; null where refused"]
-    gap_std: Deviation
-    gap_ci_low: Bootstrap
-    gap_ci_high: Bootstrap
-    twin_accuracy: Annotated[
+    conjunction: Annotated[
         float | None,
-        "share of scenarios in which both the control and the twin control are correct; null without that arm",
+        "share of scenarios with control, twin, void and both crossed questions right, mean over runs; null without "
+        "the arms twin_control and crossed",
     ]
-    twin_accuracy_std: Deviation
-    n_twins: Annotated[int, "scenarios in which both are decided, in the run that has most"]
+    conjunction_ci_low: Bootstrap
+    conjunction_ci_high: Bootstrap
+    n_conjunction: Annotated[int, "scenarios in which that is decided, in the run that has most"]
+    robust: Annotated[
+        float | None,
+        "mean over runs of Acc x max(0, AbsRec - FalseAbs), each a mean over kinds; null without a robust arm",
+    ]
+    robust_ci_low: Bootstrap
+    robust_ci_high: Bootstrap
+    inference_acc: Annotated[
+        float | None, "share of the items of late_panel and predictable_cut answered correctly, mean over runs"
+    ]
+    inference_abstains: Annotated[float | None, "share of these items abstained on, mean over runs"]
     panel: shared.Panels
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
-    refused: Annotated[str | None, "why there is no gap between pairs and arms"]
+    refused: Annotated[str | None, "why no figure joins pairs and arms; then conjunction and robust are null"]
 
 
 ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
@@ -232,7 +229,7 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 @dataclass(frozen=True, kw_only=True)
 class HypothesisRow:
-    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md). No part of PECS or PECS-R."""
+    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md). No part of PECS or of ROBUST."""
 
     model: shared.Model
     regime: shared.Regime

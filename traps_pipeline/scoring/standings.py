@@ -10,7 +10,17 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
-from traps_pipeline.scoring.metrics import BOUNDS, BROKEN, COUNTED, FIGURES, decision_counts, joined_epochs, mean
+from traps_pipeline.scoring.metrics import (
+    BOUNDS,
+    BROKEN,
+    CELL,
+    COUNTED,
+    FIGURES,
+    decision_counts,
+    joined_epochs,
+    mean,
+    pecs_of,
+)
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
 
 _RUN = ["model", "regime", "run"]
@@ -33,6 +43,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
     means, deviations = (groups[FIGURES].agg(f) for f in (mean, _deviation))
+    means["pecs_by_family"] = groups["pecs_by_family"].agg(mean)
     bounds, sums = groups[BOUNDS].agg(mean), cast(pd.DataFrame, groups[_SUMMED].sum())
     board = means.join([deviations.add_suffix("_std"), bounds, sums])
     board["n_runs"] = groups["run"].nunique()
@@ -74,8 +85,17 @@ def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """One row per (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
     cells = metrics.loc[metrics["scope"] == "all"]
-    cells = cells.assign(n_items=2 * cells["n_pairs"])
+    cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_by_family(metrics), on=CELL, how="left")
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
+
+
+def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
+    """CELL and `pecs_by_family`: PECS of Acc, AbsRec and FalseAbs with families weighted equally. A family is what the
+    paper calls a sub-scenario."""
+    families = metrics.loc[metrics["scope"].str.startswith("sub_scenario:")].groupby(CELL)
+    shares = families[["acc", "abs_rec", "false_abs"]].agg(mean)
+    pecs = pecs_of(shares["acc"].to_numpy(float), (shares["abs_rec"] - shares["false_abs"]).to_numpy(float))
+    return shares.assign(pecs_by_family=pecs)[["pecs_by_family"]].reset_index()
 
 
 def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
@@ -83,7 +103,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     groups = cells.groupby(_RUN, sort=True)
     whole = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
-    overall = whole[[*FIGURES, *BOUNDS]].agg(mean).join(counts)
+    overall = whole[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["panel"] = whole["panel"].agg(joined_epochs)
     overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)

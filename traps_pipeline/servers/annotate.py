@@ -1,4 +1,4 @@
-"""`traps annotate`: people label clips and answers without knowing whose they are, one a screen.
+"""`traps people annotate`: people label clips and answers without knowing whose they are, one a screen.
 
 The server alone knows what is shown. A browser gets a question, a clip or an answer, and a handle that is made for one
 person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.

@@ -1,4 +1,4 @@
-"""Where the pages of `traps annotate` keep what people see and say: SQLite, and the append-only file that stages read.
+"""Where `traps people annotate` keeps what people see and say: SQLite, and the append-only file that stages read.
 
 A label is committed, appended to `labels.jsonl` and brought to the disk before it is confirmed, so that a kill loses
 nothing that was. What a kill leaves between the two is appended when the store is next opened; labels of a file whose

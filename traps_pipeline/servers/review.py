@@ -1,4 +1,4 @@
-"""`traps review`: one scenario a screen, its clips in step, and decisions that are appended to the corrections."""
+"""`traps people review`: one scenario a screen, its clips in step, decisions appended to the corrections."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
         where = workspace.place if workspace.is_shared else "a database"
         raise TrapsError(
             f"{workspace.place}: the study's ledger lies in {where}, and not in a folder; export it first "
-            "(`traps ledger export`), take `database` from study.yaml, and import it again"
+            "(`traps study export-ledger`), take `database` from study.yaml, and import it again"
         )
     if Workspace.is_there(address):
         raise TrapsError(

@@ -7,7 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.base.names import Name, check_name
+from traps_pipeline.protocol.datasets import is_ill_posed
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, VQA_PROMPTS
+from traps_pipeline.storage.media import MediaSpec
 
 FORMAT = 1  # of a workspace
 Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
@@ -23,6 +25,9 @@ class Layers(BaseModel):
     steering: int = Field(ge=1, description="block whose output is steered")
     centroid: int = Field(ge=0, description="of the nearest centroid")
     sweep: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(), description="further layers for the sweep")
+    media: MediaSpec | None = Field(
+        default=None, description="how clips are shown where the model is looked into; null: as where it answers"
+    )
 
 
 class ProbeSettings(BaseModel):
@@ -36,10 +41,6 @@ class ProbeSettings(BaseModel):
     prompts: tuple[Regime, ...] = Field(
         default=(PROBE_PROMPT,), description="VQA prompts; others than standard are for what a prompt changes alone"
     )
-    others: tuple[str, ...] = Field(
-        default=(),
-        description="further probes, at the steered layer: mean difference, CCS, erased, or classifiers of sklearn",
-    )
 
 
 class NullSettings(BaseModel):
@@ -47,11 +48,8 @@ class NullSettings(BaseModel):
     datasets that they come from."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = ("isotropic", "covariance", "shuffled")
+    kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = ("covariance",)
     draws: int = Field(default=20, ge=1, description="19 are the fewest with which p can reach .05")
-
-
-ACTING = ("site", "head", "positions", "when")  # where and when steering acts
 
 
 class SteeringSettings(BaseModel):
@@ -59,61 +57,36 @@ class SteeringSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(default=(2, 5, 10), min_length=1)
-    pairs: int = Field(default=50, ge=1, description="pairs a cell, the same scenarios for every cell of a taxonomy")
+    pairs: int = Field(
+        default=50, ge=1, description="pairs a cell; none is steered along a direction that comes from its scenario"
+    )
     well_posed_pairs: int = Field(default=100, ge=2, description="pairs that a well-posed direction comes from")
     ill_posed_pairs: int = Field(default=50, ge=2, description="pairs that an ill-posed direction comes from")
-    direction_regimes: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1)
-    inference_regimes: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1)
+    direction_regimes: tuple[Regime, ...] = Field(default=(PROBE_PROMPT,), min_length=1)
+    inference_regimes: tuple[Regime, ...] = Field(default=("guided",), min_length=1)
     gaps: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(
-        default=(1.0,), description="further doses, in units of the distance between the sides' means at the layer"
+        default=(0.5, 1, 2, 4), description="further doses, in units of the distance between the sides' means there"
+    )
+    cap: float = Field(
+        default=2.0,
+        gt=0,
+        description="longest dose in gaps, in mean lengths of control states; no longer one is given",
     )
     signs: tuple[Literal["plus", "minus"], ...] = Field(
         default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
     )
-    project_out: tuple[Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)], ...] = Field(
-        default=(), description="shares of a state's part along the direction that are taken out"
-    )
-    clamp: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(
-        default=(), description="what the part along the direction is set to, in class gaps; for 0 say project_out: [1]"
-    )
     nulls: NullSettings | None = NullSettings()
-    site: Literal["residual", "attention", "mlp"] = Field(
-        default="residual", description="what of the steered block is changed: its output, or that of a part of it"
-    )
-    head: int | None = Field(default=None, ge=0, description="one attention head alone; needs site attention")
-    positions: Literal["all", "system", "stamps", "visual", "question", "last"] = Field(
-        default="all", description="tokens that are changed: all, answers included, or a part of the prompt"
-    )
-    when: Literal["mid", "J", "conformal"] | None = Field(
-        default=None, description="steer only where a gate's probe of the plain state exceeds this threshold"
-    )
     max_new_tokens: int = Field(default=512, ge=1)
 
-    @property
-    def acting(self) -> dict[str, Any]:
-        """Those of site, head, positions and when that are not as the paper has them, for keys and versions."""
-        return {n: getattr(self, n) for n in ACTING if getattr(self, n) != type(self).model_fields[n].default}
-
-    @model_validator(mode="after")
-    def _one_head(self) -> SteeringSettings:
-        if self.head is not None and self.site != "attention":
-            raise ValueError(f"head {self.head}: heads are of attention; set site: attention")
-        if self.head is not None and (self.gaps or self.clamp):
-            raise ValueError("class gaps are measured in the residual stream, not in a head: set gaps and clamp to []")
-        return self
+    def direction_pairs(self, dataset: str) -> int:
+        """Return how many pairs the directions of a dataset come from at most."""
+        return self.ill_posed_pairs if is_ill_posed(dataset) else self.well_posed_pairs
 
     @field_validator("alphas", "gaps")
     @classmethod
     def _ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if list(values) != sorted(set(values)):
             raise ValueError(f"{values} must ascend; alpha 0, the unsteered model, is always there")
-        return values
-
-    @field_validator("project_out", "clamp")
-    @classmethod
-    def _distinct(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        if len(set(values)) < len(values) or 0 in values:
-            raise ValueError(f"{values} must be different numbers and not 0 (`project_out: [1]` sets the part to 0)")
         return values
 
 
@@ -150,6 +123,14 @@ class MechanismSettings(BaseModel):
     probes: ProbeSettings = ProbeSettings()
     gate: GateSettings = GateSettings()
     patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
+    sentences: tuple[str, ...] = Field(
+        default=(
+            "I don't know: this cannot be determined from the video.",
+            "I cannot tell from the video.",
+            "It is not possible to determine this from the video.",
+        ),
+        description="abstentions whose log-probability is read behind every item, a pass each; []: none",
+    )
     system: Literal["vqa", "benchmark"] = Field(
         default="vqa", description="system prompts of extraction: the short VQA ones, or the benchmark's own"
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections import Counter
+import weakref
+from collections import Counter, OrderedDict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -332,6 +333,32 @@ def test_too_little_memory_says_how_much_is_needed(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("traps_pipeline.models.local.checkpoint.free_bytes", lambda device: 1000.0)
     with pytest.raises(TrapsError, match=r"take about 0\.0 GB as float32, and 0\.0 GB are free on cpu"):
         load_local_model(entry("llava-next-video", folder))
+
+
+def test_a_model_is_unloaded_where_another_one_needs_its_memory_and_loaded_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The memory is as large as one network, and free once the first one is really gone."""
+    monkeypatch.setattr(adapter, "_LOADED", OrderedDict())
+    entries = [entry("qwen3-vl", build_tiny("qwen3-vl", tmp_path / str(seed), seed=seed)) for seed in (7, 8)]
+    answer = load_local_model(entries[0]).generate([ask(load_local_model(entries[0]))], 4)[0].tokens
+    held = weakref.ref(load_local_model(entries[0]).network)
+    monkeypatch.setattr(adapter, "free_bytes", lambda device: 0.0 if held() is not None else 1e12)
+    other = load_local_model(entries[1])
+    assert held() is None and load_local_model(entries[1]) is other
+    held = weakref.ref(other.network)
+    del other
+    again = load_local_model(entries[0])
+    assert held() is None and again.generate([ask(again)], 4)[0].tokens == answer
+
+
+def test_a_model_that_is_spread_over_devices_gives_the_states_and_answers_of_one_device() -> None:
+    of = load_local_model(entry("gemma-4").model_copy(update={"device": "auto"}))
+    one, push = model("gemma-4"), Steering(direction(of), 2, (60.0,))
+    assert of is not one and of.inputs_device == ("cuda:0" if torch.cuda.is_available() else "cpu")
+    if not torch.cuda.is_available():
+        assert (of.forward_states(ask(of)).raw == one.forward_states(ask(one)).raw).all()
+    assert of.generate([ask(of)], 8, steering=push)[0].tokens == one.generate([ask(one)], 8, steering=push)[0].tokens
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -26,7 +26,7 @@ from traps_pipeline.models.ask import Call, Settled, Work, run_work
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
-from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds
+from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, worker
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.participants import Participants, Row
 from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
@@ -253,7 +253,7 @@ PARAMS = "checkpoint: a/b, dtype: float32, quantisation: none, do_sample: false,
         (f"{LOCAL}, device: cpu, params: {{{PARAMS}, temperature: 0.8}}", "params: do_sample: false is greedy"),
         (f"{LOCAL}, device: cpu, params: {{{PARAMS.replace('false', 'true')}}}", "params: do_sample: true needs"),
         (f"{LOCAL}, device: cpu, params: {{{PARAMS}, nf4_skip: [lm_head]}}", "params: nf4_skip goes with"),
-        ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism: only backend local"),
+        ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism, size: only backend local"),
         (
             f"{LOCAL}, device: cpu, params: {{{PARAMS}}}, mechanism: {{nf4_skip: [lm_head]}}",
             "mechanism: nf4_skip goes with",
@@ -303,3 +303,10 @@ def test_the_doctor_tries_every_family_and_says_what_is_not_here(capsys: pytest.
         assert f"ok   {family}, batches: equal" in said
     for part in ("devices: torch", "nf4: ", "checkpoints: qwen3-vl-8b is"):
         assert f"ok   {part}" in said
+
+
+def test_models_of_one_device_share_a_worker_and_each_device_has_its_own() -> None:
+    made = {device: LocalBackend(entry("qwen3-vl").model_copy(update={"device": device}))._worker
+            for device in ("cpu", "cuda", "cuda:0", "cuda:1")}  # fmt: skip
+    assert made["cuda"] is made["cuda:0"] is worker("cuda:0")
+    assert len({id(each) for each in made.values()}) == 3

@@ -7,6 +7,11 @@ const FIGURES = [
   { field: "false_abs", title: "FalseAbs %", print: percent },
   { field: "j", title: "J", print: fraction },
 ];
+const ROBUST = [
+  { field: "conjunction", title: "Conjunction %", print: percent },
+  { field: "robust", title: "Robust", print: fraction },
+  { field: "inference_acc", title: "Inferred %", print: percent },
+];
 const PAPER = FIGURES.filter(({ field }) => field !== "j");
 
 // A figure with its deviation over runs and its interval below it.
@@ -65,10 +70,7 @@ async function leaderboardView(route) {
     })),
     { title: "Rank", number: true, hint: "by PECS among the models of a regime; ranks in between are not separable" },
     ...(robust.size
-      ? [
-          { title: "PECS-R", number: true, group: true, hint: info.legend["PECS-R"] },
-          { title: "gap", number: true, hint: info.legend.gap },
-        ]
+      ? ROBUST.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
       : []),
     ...(withPaper
       ? PAPER.map(({ field, title }, k) => ({
@@ -93,7 +95,7 @@ async function leaderboardView(route) {
     ),
     rankOf(row.own),
     ...(robust.size
-      ? [row.robust ? `${fraction(row.robust.pecs_r)}` : NOT_RUN, row.robust ? fraction(row.robust.gap) : NOT_RUN]
+      ? ROBUST.map(({ field, print }) => (row.robust ? print(row.robust[field]) : NOT_RUN))
       : []),
     ...(withPaper
       ? PAPER.map(({ field, print }) =>

@@ -12,29 +12,40 @@ once: one prompt's hooks would see another's states (`backend` uses one worker t
 
 from __future__ import annotations
 
+import gc
+from collections import OrderedDict
 from threading import Lock
 from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
-from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory, require_no_code
+from traps_pipeline.models.local.checkpoint import (
+    Checkpoint,
+    find_checkpoint,
+    free_bytes,
+    require_memory,
+    require_no_code,
+    weight_bytes,
+)
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import Generated, LocalModel, States
 from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.sampling import Sampling
-from traps_pipeline.models.local.settings import LocalParams
+from traps_pipeline.models.local.settings import SPREAD, LocalParams
 from traps_pipeline.models.registry import ModelEntry
 
 __all__ = ["Generated", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
 
 NF4_CPU_BLOCK = 64
-_LOADED: dict[str, LocalModel] = {}
+WEIGHTS_SHARE = 0.7  # of what is free that weights may take before other models make room; the rest is for batches
+_LOADED: OrderedDict[str, LocalModel] = OrderedDict()  # the one that was asked for last comes last
 _LOADING = Lock()
 
 
 def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
-    """The entry's checkpoint in memory, as the entry says; loaded once a process.
+    """Return the entry's checkpoint in memory, as the entry says; loaded once a process, and unloaded where another
+    model needs its memory.
 
     inside: as it is looked into (`mechanism:` of the entry), not as it answers. Raises TrapsError when weights, device,
     memory or library are missing, or when the checkpoint is of no class that fits.
@@ -50,16 +61,36 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
     )
     with _LOADING:
         if key not in _LOADED:
+            _make_room(checkpoint, params, device)
             require_memory(checkpoint, params.dtype, params.quantisation, device)
             _LOADED[key] = _load(checkpoint, params, device)
+        _LOADED.move_to_end(key)
         return _LOADED[key]
+
+
+def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
+    """Unload models of the device, the one asked for least recently first, until the weights fit.
+
+    The memory of a model that a caller still holds is free only when the caller drops it.
+    """
+    import torch
+
+    needed = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
+    others = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
+    for key in others:
+        if needed <= WEIGHTS_SHARE * free_bytes(device):
+            return
+        del _LOADED[key]
+        gc.collect()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
 
 
 def require_device(device: str) -> None:
     """Raises TrapsError when this machine has no such device."""
     import torch
 
-    there = device == "cpu" or (device == "mps" and torch.backends.mps.is_available())
+    there = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
     if device.startswith("cuda"):
         number = int(device.partition(":")[2] or 0)
         there = torch.cuda.is_available() and number < torch.cuda.device_count()
@@ -104,7 +135,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
             f"checkpoint {checkpoint.name}: {type(processor).__name__} takes no videos; name a model that does"
         )
     processor.tokenizer.padding_side = "left"
-    if params.quantisation == "none":
+    if params.quantisation == "none" and device != SPREAD:
         network = network.to(device)
     elif device == "cpu":
         _require_packable(network, checkpoint.name)
@@ -140,4 +171,7 @@ def _precision(params: LocalParams, device: str) -> dict[str, Any]:
             llm_int8_skip_modules=list(params.nf4_skip) or None,
         )
         options["device_map"] = {"": device}
+    if device == SPREAD:
+        require("nf4")  # which brings accelerate
+        options["device_map"] = "auto"
     return options

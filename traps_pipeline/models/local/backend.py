@@ -1,4 +1,4 @@
-"""Local models as a backend: requests that wait are answered together, by one worker thread for all models.
+"""Local models as a backend: requests that wait are answered together, by one worker thread for each device.
 
 Asking stays what it is for an API: one request, one outcome, one row of the ledger. So a crash loses the batch that was
 running and nothing else.
@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from threading import Event
 
 from traps_pipeline.base.cores import cores
@@ -23,7 +24,12 @@ from traps_pipeline.storage.media import Frames, MediaSpec, sample
 from traps_pipeline.video.encode import DamagedClip
 
 GATHER_S = 0.01  # after the first waiting request, for those that the same answers have set free
-_WORKER = ThreadPoolExecutor(1, thread_name_prefix="local-model")
+
+
+@cache
+def worker(device: str) -> ThreadPoolExecutor:
+    """Return the one thread that works with the models of a device."""
+    return ThreadPoolExecutor(1, thread_name_prefix=f"local-model-{device}")
 
 
 @dataclass(eq=False)
@@ -47,6 +53,7 @@ class LocalBackend:
         if not isinstance(entry, ModelEntry) or entry.media is None:
             raise TrapsError(f"{entry.id}: only a model can be a local checkpoint; a judge is asked over the network")
         self._entry, self._spec, self._params = entry, entry.media, entry.local_params()
+        self._worker = worker("cuda:0" if entry.device == "cuda" else entry.device or "cpu")
         find_checkpoint(self._params)  # so that missing weights are told before anything is asked
         self._waiting = _Batch()
         self._running: asyncio.Task[None] | None = None
@@ -68,7 +75,7 @@ class LocalBackend:
             for answer in batch.answers:
                 answer.add_done_callback(batch.forget)
             try:
-                outcomes = await asyncio.get_running_loop().run_in_executor(_WORKER, self._answers, batch)
+                outcomes = await asyncio.get_running_loop().run_in_executor(self._worker, self._answers, batch)
             except Exception as error:  # noqa: BLE001 - raised by `ask` in each request's own task
                 for answer in batch.answers:
                     if not answer.done():

@@ -17,7 +17,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.paths import ROOT
-from traps_pipeline.models.local.settings import Dtype, LocalParams, Quantisation
+from traps_pipeline.models.local.settings import SPREAD, Dtype, LocalParams, Quantisation
 
 _FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
@@ -163,7 +163,12 @@ def _shapes(file: Path) -> list[Sequence[int]]:
 
 
 def free_bytes(device: str) -> float:
-    """Memory that is free on a device, in bytes; infinite where the system does not say."""
+    """Return the memory that is free on a device, in bytes; infinite where the system does not say."""
+    if device == SPREAD:
+        import torch
+
+        if torch.cuda.is_available():
+            return sum(free_bytes(f"cuda:{number}") for number in range(torch.cuda.device_count()))
     if device.startswith("cuda"):
         import torch
 

@@ -1,14 +1,12 @@
-"""Decoding of one batch: the library's own `generate`, from which finished rows leave, and which is resumed at the
-steered block where prefixes are kept (`prefixes`)."""
+"""Decoding of one batch: the library's own `generate`, from which finished rows leave."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prefixes import Resumable, resumed, without_pictures
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
 
@@ -16,20 +14,21 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+class Decodes(Protocol):
+    """A `LocalModel`, as far as it is used here."""
+
+    network: Any
+
+    def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Inputs on the model's device."""
+        ...
+
+
 class Steers(Protocol):
     """What may change hidden states during a pass: `mechanism.hook.Steering`."""
 
-    @property
-    def resumes_at(self) -> int:
-        """The last block up to which passes are as they were, but for a change of that block's output; 0: none."""
-        ...
-
     def rows(self, chosen: Sequence[int]) -> Steers:
         """That of some of the prompts."""
-        ...
-
-    def begun(self, chosen: Sequence[int]) -> Steers:
-        """That of some of the prompts, for passes behind them."""
         ...
 
     def applied(self, model: Any) -> AbstractContextManager[None]:
@@ -37,13 +36,13 @@ class Steers(Protocol):
         ...
 
 
-def steered(steering: Steers | None, model: Resumable) -> AbstractContextManager[None]:
+def steered(steering: Steers | None, model: Decodes) -> AbstractContextManager[None]:
     """The steering, or nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 
 def decode(
-    model: Resumable,
+    model: Decodes,
     prompts: Sequence[Prompt],
     max_new_tokens: int,
     sampling: Sampling | None,
@@ -59,11 +58,6 @@ def decode(
     nucleus = SeededNucleus(sampling) if sampling else None
     ends = _ends(config.eos_token_id)
     steers = steering
-    prefixes, at = None, steering.resumes_at if steering is not None else 0
-    if at and use_cache and model.prefixes.active:
-        prefixes = model.prefixes.of(model, prompts, at)
-        if prefixes is not None:
-            prompts = without_pictures(model, prompts, at)
     inputs: dict[str, Any] = model.placed(collate(prompts, config.pad_token_id))
     width, rows = inputs["input_ids"].shape[1], [*range(len(prompts))]
     answers: dict[int, list[int]] = {}
@@ -71,10 +65,7 @@ def decode(
         while True:
             stopping = _Stopping(stopped)
             criteria: list[Any] = [stopping] + ([_HalfEnded(ends, width)] if use_cache else [])
-            with ExitStack() as stack:
-                if prefixes is not None:
-                    stack.enter_context(resumed(model, prefixes, at))
-                stack.enter_context(steered(steers, model))
+            with steered(steers, model):
                 out = model.network.generate(
                     **inputs,
                     max_new_tokens=max_new_tokens + width - inputs["input_ids"].shape[1],
@@ -92,14 +83,14 @@ def decode(
             going = [place for place in range(len(rows)) if rows[place] not in answers]
             if not going:
                 return [answers[row] for row in range(len(prompts))]
-            inputs, prefixes = _without(model, inputs, out, going), None
+            inputs = _without(model, inputs, out, going)
             rows = [rows[place] for place in going]
-            steers = steering.begun(rows) if steering else None
+            steers = steering.rows(rows) if steering else None
             if nucleus:
                 nucleus.keep(going)
 
 
-def _without(model: Resumable, inputs: dict[str, Any], out: Any, going: Sequence[int]) -> dict[str, Any]:
+def _without(model: Decodes, inputs: dict[str, Any], out: Any, going: Sequence[int]) -> dict[str, Any]:
     """What the rows that go on continue from: their tokens so far, and their part of the cache."""
     import torch
 

@@ -17,10 +17,9 @@ from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steered
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prefixes import PrefixMemory
 from traps_pipeline.models.local.prompt_batches import Prompt, batches
 from traps_pipeline.models.local.sampling import Sampling
-from traps_pipeline.models.local.settings import LocalParams
+from traps_pipeline.models.local.settings import SPREAD, LocalParams
 from traps_pipeline.models.local.vision_cache import ClipMemory
 
 if TYPE_CHECKING:
@@ -58,10 +57,11 @@ class LocalModel:
         self.network, self.processor, self.checkpoint, self.params, self.device = (
             network, processor, checkpoint, params, device,
         )  # fmt: skip
+        self.inputs_device = str(network.device) if device == SPREAD else device  # of the embeddings
         self.dtype, self.quantisation = params.dtype, params.quantisation
         self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
         self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)
-        self.clips, self.prefixes = ClipMemory(), PrefixMemory()
+        self.clips = ClipMemory()
         self._processing = Lock()  # tokenizers are not for several threads at once
         network.generation_config = self._plain_generation()
 
@@ -167,11 +167,6 @@ class LocalModel:
         """Inside, the vision tower sees each clip once (`clips`)."""
         return self.clips.remembering(self.network)
 
-    def resuming(self) -> AbstractContextManager[None]:
-        """Inside, steered answers are resumed at the steered block, and each prompt passes those below it once
-        (`prefixes`)."""
-        return self.prefixes.remembering()
-
     # --- hidden states ------------------------------------------------------------------------------------------------
 
     def forward(self, prompt: Prompt) -> Any:
@@ -201,19 +196,12 @@ class LocalModel:
         with steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as kept:
             self.forward(prompt)
         assert kept.normed is not None and len(kept.raw) == self.n_layers + 1
-        rows = torch.stack([row.float() for row in (*kept.raw, kept.normed)]).cpu().numpy()
+        rows = torch.stack([row.float().cpu() for row in (*kept.raw, kept.normed)]).numpy()
         return States(rows[:-1], rows[-1])
 
     def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
         """The prompt with the first token of its greedy answer behind it."""
-        import torch
-
-        token = self.generate([prompt], 1, steering=steering)[0].tokens[0]
-        inputs = dict(prompt.inputs)
-        for name in prompt.sequences:
-            more = {"input_ids": token, "attention_mask": 1}.get(name, 0)  # else: of no modality
-            inputs[name] = torch.cat([inputs[name], inputs[name].new_full((1, 1), more)], dim=1)
-        return Prompt(prompt.text, inputs)
+        return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
     # --- answers ------------------------------------------------------------------------------------------------------
 
@@ -303,9 +291,9 @@ class LocalModel:
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Inputs of a prompt or a batch, on the model's device, pictures in its precision."""
-        dtype = self.network.dtype
+        dtype, device = self.network.dtype, self.inputs_device
         return {
-            name: value.to(self.device, dtype) if value.is_floating_point() else value.to(self.device)
+            name: value.to(device, dtype) if value.is_floating_point() else value.to(device)
             for name, value in inputs.items()
         }
 

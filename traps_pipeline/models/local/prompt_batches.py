@@ -40,6 +40,17 @@ class Prompt:
         """Names of the inputs that have one value a token."""
         return [name for name, value in self.inputs.items() if value.shape == self.inputs["input_ids"].shape]
 
+    def followed_by(self, tokens: Sequence[int]) -> Prompt:
+        """Return the prompt with tokens of an answer behind it."""
+        import torch
+
+        inputs = dict(self.inputs)
+        more = {"input_ids": list(tokens), "attention_mask": [1] * len(tokens)}  # else: of no modality
+        for name in self.sequences:
+            row = inputs[name].new_tensor(more.get(name, [0] * len(tokens)))
+            inputs[name] = torch.cat([inputs[name], row[None]], dim=1)
+        return Prompt(self.text, inputs)
+
     @property
     def form(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
         """What prompts must share to go into one batch: the shapes of the clip's tensors but for the first axis."""

@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Dtype = Literal["float32", "bfloat16", "float16"]
 Quantisation = Literal["none", "nf4"]
-DEVICE = r"^(cpu|mps|cuda(:\d+)?)$"
+SPREAD = "auto"  # device of a model that is spread over all GPUs of the process, or lies on the CPU without any
+DEVICE = r"^(cpu|mps|auto|cuda(:\d+)?)$"
 
 
 class LocalParams(BaseModel):
@@ -43,6 +44,15 @@ class LocalParams(BaseModel):
         if self.nf4_skip and self.quantisation != "nf4":
             raise ValueError("nf4_skip goes with quantisation: nf4")
         return self
+
+
+class NetworkSize(BaseModel):
+    """The size of a network, for `traps plan`. parameters_b: in billions. layers, width: of the language model."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    parameters_b: float = Field(gt=0)
+    layers: int = Field(ge=1)
+    width: int = Field(ge=1)
 
 
 class MechanismSpec(BaseModel):

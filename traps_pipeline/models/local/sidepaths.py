@@ -3,10 +3,10 @@
 Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks make no keys and values: each reads
 those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block adds a
 vector of its own that is made of the token and its embedding (`per_layer_input`). So a state at block l does not say
-what blocks behind l make of it; whoever puts another state there, or goes on from it, gives them both as well.
+what blocks behind l make of it: a patch there replaces both as well.
 
-Qwen3-VL's deepstack features, which are added between blocks, are inputs of its decoder: `prefixes` and
-`mechanism.patching_effects` see to them there.
+Qwen3-VL's deepstack features, which are added between blocks, are inputs of its decoder: `mechanism.patching_effects`
+replaces them there.
 """
 
 from __future__ import annotations

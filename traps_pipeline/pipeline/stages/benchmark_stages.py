@@ -80,7 +80,7 @@ scene_specs = stage(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
             "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that a panel closes "
-            "be answered from its last frame. `traps certify` computes this again.",
+            "be answered from its last frame. `traps benchmark certify` computes this again.",
             _evidence("answerable_voids"),
         ),
         Check(

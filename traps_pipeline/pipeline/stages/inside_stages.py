@@ -9,16 +9,17 @@ from traps_pipeline.mechanism.control_rows import (
     PATCHING,
     PROBE_BASELINES,
     RISK_COVERAGE,
+    SENTENCES,
     STEERING_NULLS,
     STEERING_PECS,
 )
 from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
-from traps_pipeline.mechanism.probing_versions import patching_version
+from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
 from traps_pipeline.models.registry import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
 from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
-from traps_pipeline.pipeline.stages.evaluation_stages import verdicts
+from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
     ANSWERED,
     GROUP,
@@ -45,6 +46,16 @@ patching_settings = source(
     lambda workspace, key: patching_version(workspace, Extraction.parse(key)),
     group=GROUP,
     doc="The inputs of patching besides items: checkpoint, precision, prompt, pairs and sites.",
+    kinds=["yaml"],
+    scheme=EXTRACTION,
+)
+
+
+sentence_settings = source(
+    "sentence_settings",
+    lambda workspace, key: sentence_version(workspace, Extraction.parse(key)),
+    group=GROUP,
+    doc="The inputs of sentences besides items and answers: checkpoint, precision, prompt, the study's sentences.",
     kinds=["yaml"],
     scheme=EXTRACTION,
 )
@@ -174,6 +185,32 @@ item_scores = stage(
     scheme=EXTRACTION,
     cost="machine",
     wants=_gated,
+)
+
+
+def _make_sentences(workspace: Workspace, key: str) -> Made:
+    """How likely whole abstentions are to a model behind every item, beside its own answers."""
+    from traps_pipeline.mechanism.sentences import sentence_rows
+    from traps_pipeline.mechanism.stages import examined_model
+
+    extraction = Extraction.parse(key)
+    return Made(sentence_rows(workspace, examined_model(workspace, extraction.model), extraction))
+
+
+def _read_in_sentences(wanted: Wanted, key: str) -> bool:
+    extraction = Extraction.parse(key)
+    asked = {(e.model, e.regime) for e in wanted.evaluations}
+    return wanted.reads_sentences and (extraction.model, extraction.prompt) in asked
+
+
+sentences = stage(
+    SENTENCES,
+    _make_sentences,
+    group=GROUP,
+    parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
+    scheme=EXTRACTION,
+    cost="machine",
+    wants=_read_in_sentences,
 )
 
 

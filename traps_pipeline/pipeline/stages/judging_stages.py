@@ -38,7 +38,7 @@ judge_validation = source(
     "judge_validation",
     _validation_version,
     group=GROUP,
-    doc="The comparison of the judge with two annotators, which `traps confabulation validate` writes.",
+    doc="The comparison of the judge with two annotators, which `traps people validate` writes.",
     kinds=["parquet"],
 )
 _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])

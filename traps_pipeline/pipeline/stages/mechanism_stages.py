@@ -190,7 +190,7 @@ directions = stage(
     DIRECTIONS,
     _make_directions,
     group=GROUP,
-    code="2",
+    code="3",
     parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
     scheme=EXTRACTION,
     wants=steers,
@@ -237,7 +237,7 @@ steering = stage(
     STEERING_TABLE,
     Collect(_collect_steering),
     group=GROUP,
-    code="3",
+    code="4",
     parents=[
         of(items, by_dataset),
         of(directions, EVERY, need="some"),
@@ -296,7 +296,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
 
 _ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", parents=_ABOVE, wants=steers)
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="3", parents=_ABOVE, wants=steers)
 
 
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="3", parents=_ABOVE, wants=steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="4", parents=_ABOVE, wants=steers)

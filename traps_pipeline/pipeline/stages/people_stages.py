@@ -30,7 +30,7 @@ people = source(
     "people",
     lambda workspace, key: labels_version(workspace.labels),
     group=GROUP,
-    doc="The labels that people gave on the pages of `traps annotate`, as they were appended.",
+    doc="The labels that people gave on the pages of `traps people annotate`, as they were appended.",
     kinds=["json"],
 )
 annotation_protocol = source(

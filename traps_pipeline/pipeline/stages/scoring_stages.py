@@ -108,8 +108,8 @@ def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
 
 
 def _make_robust(workspace: Workspace, _: None) -> Made:
-    """PECS-R, its gap to PECS and paired twin accuracy of every model and regime with all four datasets and an arm;
-    empty if no arm was run."""
+    """Conjunction, robust figure and inference of every model and regime with all four datasets and an arm; empty if no
+    arm was run."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.robust import robust as without_shortcuts
 
@@ -117,7 +117,7 @@ def _make_robust(workspace: Workspace, _: None) -> Made:
     if judged.empty:
         raise TrapsError("robust: no verdicts yet; materialize verdicts for a cell first")
     table = without_shortcuts(judged)
-    return Made(table, shown={"PECS-R": rows_shown(table)})
+    return Made(table, shown={"conjunction": rows_shown(table)})
 
 
 def _wrong_robust(workspace: Workspace, key: str | None, made: Made) -> str:
@@ -175,7 +175,7 @@ robust = stage(
     checks=[
         Check(
             "robust_rows_hold",
-            "PECS-R and its shares lie in [0, 1], intervals are ordered, the gap is PECS - PECS-R.",
+            "Figures lie in [0, 1] and in their intervals.",
             _wrong_robust,
         )
     ],

@@ -1,4 +1,4 @@
-"""`traps harness`: the folder with which inspect_ai and lmms-eval evaluate models on a release."""
+"""`traps publish harness`: the folder with which inspect_ai and lmms-eval evaluate models on a release."""
 
 from __future__ import annotations
 

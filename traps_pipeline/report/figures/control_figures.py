@@ -10,7 +10,7 @@ import numpy as np
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import arrow, frame_plane
+from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.control_reports import beside
 from traps_pipeline.report.tables.patching_tables import SITES
@@ -57,7 +57,7 @@ def probe_baselines(results: Results) -> Figure:
         for ax, model in zip(axes, models, strict=True):
             _baselines(ax, rows.loc[rows["model"] == model])
             sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
-            ax.set_title(f"{plain(model)[:40]}, {_from_to(sides.min(), sides.max())} items a side", size=7.5)
+            ax.set_title(f"{plain(model)[:40]}, {from_to(sides.min(), sides.max())} items a side", size=7.5)
             ax.set_ylabel("AUROC")
         handles = [Line2D([], [], color=INK, marker="o", markersize=4, label="states, layer chosen without the target")]
         handles += [
@@ -67,10 +67,6 @@ def probe_baselines(results: Results) -> Figure:
         handles += [Line2D([], [], color=GRID, linewidth=6, label="noise, mean ± 2 sd")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
-
-
-def _from_to(low: int, high: int) -> str:
-    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
@@ -223,7 +219,8 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
 
 def doses_among_nulls(results: Results) -> Figure:
     """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
-    gap. Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
+    gap, on pairs that the direction does not come from; doses that are longer than the cap, in states, are not given.
+    Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
     and subtracted on voids (−); a larger dot stands for more draws. The direction does something of its own where its
     line ends away from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions. n:
     answers of a side, † fewer than ten. p: share of the draws of each null, in the order of the legend, that do as
@@ -238,14 +235,14 @@ def doses_among_nulls(results: Results) -> Figure:
     datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.7 + 2.0 * len(cells))
-        axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True, sharex=True)
+        axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True)
         for line, (model, directions, regime) in zip(axes, cells, strict=True):
             of = rows.loc[(rows["model"] == model) & (rows["directions"] == directions) & (rows["regime"] == regime)]
             for ax, dataset in zip(line, datasets, strict=True):
                 part = of.loc[of["target"] == dataset]
                 _dose(ax, part, colour)
                 own = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
-                n = _from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
+                n = from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
                 ranks = _p_values(results.nulls, str(model), str(directions), str(regime), dataset)
                 ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
@@ -292,4 +289,5 @@ def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
             ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
                        marker=marker, linewidths=0, clip_on=False)  # fmt: skip
             ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
-            ax.set_xticks([0, top / 2, top, 1.39 * top, 1.94 * top], ["0", f"{top / 2:g}", f"{top:g}", "+", "−"])
+            given = [dose for dose in sorted(set(void["gaps"])) if dose == 0 or dose >= top / 4]
+            ax.set_xticks([*given, 1.39 * top, 1.94 * top], [*(f"{dose:g}" for dose in given), "+", "−"])

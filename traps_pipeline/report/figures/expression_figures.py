@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import SHORT
-from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.protocol.regimes import PROMPTING, STANDARD
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.steering_tables import why
 from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, figure_style, new_figure, not_run_figure, plain
@@ -24,9 +26,9 @@ def states_and_output(results: Results) -> Figure:
     """Every item by what states and output say of it, both read under the standard VQA prompt. Up: the score of a probe
     that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the answer begins with an
     abstention. A filled marker was answered under standard, a hollow one abstained on. Orange filled markers above the
-    line and left of it are encoded and not expressed. Above each panel: how well either orders voids before controls
-    (AUROC), and what noise gives under the same split (mean and two deviations). A gap is one of orders too only where
-    states are above the output by more than that."""
+    line and left of it are encoded and not expressed. Above each panel: how well each orders voids before controls
+    (AUROC), sentences being whole abstentions against the model's own answer, and what noise gives under the same split
+    (mean and two deviations). A gap is one of orders too only where states are above the output by more than that."""
     rows = scored_items(results)
     if not len(rows):
         absent = why(results) if results.is_study else "the paper prints no scores of items"
@@ -41,9 +43,9 @@ def states_and_output(results: Results) -> Figure:
             for ax, dataset in zip(line, datasets, strict=True):
                 part = rows.loc[(rows["model"] == model) & (rows["dataset"] == dataset)]
                 _scatter(ax, part)
-                states, output = orders(part)
-                figures = f"states {states:.2f}, output {output:.2f}{_floor(results, str(model), dataset)}"
-                ax.set_title(f"{plain(str(model))[:20]}: {SHORT[dataset]}, n {len(part)}\n{figures}", size=6.5)
+                figures = ", ".join(f"{name} {area:.2f}" for name, area in orders(part).items())
+                title = f"{plain(str(model))[:20]}: {SHORT[dataset]}, n {len(part)}\n{figures}"
+                ax.set_title(title + _floor(results, str(model), dataset), size=6)
             line[0].set_ylabel("states: log-odds of void")
         for ax in axes[-1]:
             ax.set_xlabel("output: log-odds of abstaining", size=7)
@@ -59,16 +61,23 @@ def states_and_output(results: Results) -> Figure:
 
 
 def scored_items(results: Results) -> pd.DataFrame:
-    """Return the items of which both a score of states and an output margin are known."""
-    rows = results.item_scores
-    return rows.loc[rows["margin"].notna() & rows["own"].notna()]
+    """Return the items of which both a score of states and an output margin are known, with `sentence`: how much
+    likelier an abstention is than the model's own answer under standard, nats a token (NaN where it was not read)."""
+    rows, read = results.item_scores, results.sentences
+    read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
+    read = read.assign(sentence=read["abstention"].astype(float) - read["own"].astype(float))
+    rows = rows.merge(read[["model", "item_id", "sentence"]], on=["model", "item_id"], how="left")
+    return rows.loc[rows["margin"].notna() & rows["own"].notna()].reset_index(drop=True)
 
 
-def orders(rows: pd.DataFrame) -> tuple[float, float]:
-    """Return the AUROC of states and of output on some items."""
-    void = (rows["side"] == "void").to_numpy()
-    states, output = auroc(void, rows[["own", "margin"]].to_numpy(float))
-    return float(states), float(output)
+def orders(rows: pd.DataFrame) -> dict[str, float]:
+    """Return the AUROC of states, of the output margin, and of whole sentences where they were read, on some items."""
+    void, areas = (rows["side"] == "void").to_numpy(), dict[str, float]()
+    for name, column in (("states", "own"), ("margin", "margin"), ("sentences", "sentence")):
+        values = rows[column].to_numpy(float)
+        if np.isfinite(values).all():
+            areas[name] = float(auroc(void, values))
+    return areas
 
 
 def _floor(results: Results, model: str, dataset: str) -> str:

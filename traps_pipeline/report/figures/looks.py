@@ -75,3 +75,8 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colo
     style = {"arrowstyle": "-|>,head_width=0.12,head_length=0.25", "color": colour, "linewidth": 0.8}
     style |= {"shrinkA": 2.5, "shrinkB": 2.5, "mutation_scale": 10}
     axes.annotate("", end, start, arrowprops=style, zorder=2.5, annotation_clip=False)
+
+
+def from_to(low: int, high: int) -> str:
+    """Return `5`, or `5 to 16`."""
+    return f"{low}" if low == high else f"{low} to {high}"

@@ -11,6 +11,7 @@ import numpy as np
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
 from traps_pipeline.protocol.datasets import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
+from traps_pipeline.report.figures.looks import from_to
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.probe_tables import best_layers
 from traps_pipeline.report.tables.steering_tables import why
@@ -160,7 +161,8 @@ def dose_response(results: Results) -> Figure:
     """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along directions
     of the standard prompt under guided inference if they were run. Directions of the occlusion family are blue, those
     of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are strong and
-    the others faint. Grey is the mean over the paths with its 95 % interval from resampled scenarios."""
+    the others faint. n is the number of answers of a marker. Grey is the mean over the paths with its 95 % interval
+    from resampled scenarios."""
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
@@ -176,7 +178,7 @@ def dose_response(results: Results) -> Figure:
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
                 _mean_band(ax, _of_panel(results.shares, part, path_set, side))
                 _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
-                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}", size=6.5)
+                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_answers(part, side)}", size=6.5)
                 ax.set_xlabel("α")
         for ax in pairs[len(panels) :].flat:
             ax.set_axis_off()
@@ -186,6 +188,12 @@ def dose_response(results: Results) -> Figure:
         more = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
         _legend(figure, *more, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
     return figure
+
+
+def _answers(part: pd.DataFrame, side: str) -> str:
+    """How many answers a marker stands for."""
+    counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
+    return f", n {from_to(min(counts), max(counts))}" if len(counts) else ""
 
 
 def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:

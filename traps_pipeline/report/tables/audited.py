@@ -1,4 +1,4 @@
-"""The statements of the paper that its own tables and text do not bear out (`traps audit`)."""
+"""The statements of the paper that its own tables and text do not bear out (`traps results audit`)."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.mechanism_rows import CLAMP, PROJECT_OUT
 from traps_pipeline.mechanism.transfer_paths import path_name, probed_taxonomy
 from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
@@ -152,7 +151,7 @@ def steering_nulls(results: Results) -> list[PrintedTable]:
 
 
 def _dose(rows: pd.DataFrame) -> list[str]:
-    words = {"alpha": "α {:g}", "gap": "{:g} gap", PROJECT_OUT: "{:.0%} taken out", CLAMP: "set to {:g} gap"}
+    words = {"alpha": "α {:g}", "gap": "{:g} gap"}
     return [words[unit].format(dose) if dose else "none" for unit, dose in zip(rows["unit"], rows["dose"], strict=True)]
 
 

@@ -13,7 +13,7 @@ from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, f
 if TYPE_CHECKING:
     import pandas as pd
 
-BY_PEOPLE = "nobody has labelled yet (run traps annotate)"
+BY_PEOPLE = "nobody has labelled yet (run traps people annotate)"
 _FIGURES = {name: metric.heading for name, metric in METRIC_WORDS.items()}
 _PERCENT = (*SHARES, "sensitivity", "specificity")
 
@@ -72,7 +72,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
         "judged and corrected in the same resamples of scenarios; a correction assumes that the panel errs alike on "
         "the answers of all models"
     ]
-    why = "not validated: people labelled no answers (run traps annotate)"
+    why = "not validated: people labelled no answers (run traps people annotate)"
     reasons = sorted(set(results.panel_errors["undefined"].dropna()))
     return [
         PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, why),
@@ -114,7 +114,7 @@ def _score_of_people(rows: pd.DataFrame) -> str:
 
 def _validated(rows: pd.DataFrame) -> str:
     if rows.empty:
-        return "not validated, people have labelled none of its answers (run traps annotate)"
+        return "not validated, people have labelled none of its answers (run traps people annotate)"
     told = [
         f"{row['task']} sensitivity {_shown(row, 'sensitivity')} %, specificity {_shown(row, 'specificity')} %"
         for row in rows.to_dict("records")

@@ -53,7 +53,7 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
         "interval, Bayesian bootstrap over scenarios with one unseen",
         "rules: panel-rule, length-rule and wording-rule, each of which reads one cue and understands nothing; what a "
         "rule gets too, a model need not understand anything for; guess: Acc of a guess among the answers offered",
-        "no part of PECS or PECS-R",
+        "no part of PECS or of the arms' figures",
     ]
     if any(dose.counts_as.startswith("no void") for dose in hypothesis.doses):
         notes.append(

@@ -87,7 +87,7 @@ def validation(results: Results) -> list[PrintedTable]:
         Column("n_failures", "Failures", "count"), Column("n_labels", "Labels", "count"),
     ]  # fmt: skip
     notes = ["labels of both annotators side by side, no consensus"] + ([] if results.is_study else ["epoch original"])
-    why = "no label files of annotators (`traps confabulation validate`)" if results.is_study else ""
+    why = "no label files of annotators (`traps people validate`)" if results.is_study else ""
     return [
         PrintedTable(
             "judge_validation",

@@ -3,7 +3,7 @@
 A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
 the record cost thousands of rollouts, and its new look moves neither camera nor panel, the worlds stay and what pixels
 say is measured again (`relook_family`). Either way it is the record that `sample_family` would have drawn; whoever uses
-it then runs `traps certify`.
+it then runs `traps benchmark certify`.
 """
 
 from __future__ import annotations

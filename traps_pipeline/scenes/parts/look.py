@@ -22,7 +22,7 @@ from traps_pipeline.scenes.picture.render import SUPERSAMPLE
 if TYPE_CHECKING:
     import mujoco
 
-# What may vary, as `traps sample --look` names it.
+# What may vary, as `traps benchmark sample --look` names it.
 PARTS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 OF_OCCLUSION = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
 # Colours of the panel (sRGB): dark, dull, and none that a question names or that is taken for one in another light.

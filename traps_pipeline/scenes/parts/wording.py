@@ -12,10 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.offers import without_choices
 from traps_pipeline.scenes.physics.kit import COLOURS, Inventory, Taxonomy
-
-YES_OR_NO, LEFT_OR_RIGHT, ANY_TWO = ("yes", "no"), ("left", "right"), ("this", "that")
 
 # --- well-posed questions ---------------------------------------------------------------------------------------------
 
@@ -35,23 +32,12 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
-    """The values that a question fills its template's placeholders with, also without the choices that it may offer;
-    None if it fits none of the templates."""
-    for template in (*templates, *_open_forms(tuple(templates))):
+    """Return the values that fill a template's placeholders in a question; None if it fits none of the templates."""
+    for template in templates:
         match = _pattern(template).fullmatch(question)
         if match:
             return match.groupdict()
     return None
-
-
-@cache
-def _open_forms(templates: tuple[str, ...]) -> list[str]:
-    """Templates without their choices: those that they spell out ('yes or no'), or those of the scenario."""
-    forms = []
-    for template in templates:
-        filled = template.replace("{choices}", " or ".join(ANY_TWO))
-        forms += [without_choices(filled, labels) for labels in (YES_OR_NO, LEFT_OR_RIGHT, ANY_TWO)]
-    return [form for form in forms if form is not None]
 
 
 def choices_in(text: str) -> tuple[str, ...]:

@@ -1,35 +1,35 @@
 """Arms: further clips and questions of a scenario, each of which takes one shortcut away (docs/arms.md).
 
-A shortcut tells control from void without looking at what happens: a panel in the first frame, a short clip, a question
-without choices. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be answered
+A shortcut tells control from void without looking at what happens: a panel in the first frame, a short clip, the words
+of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be answered
 can be answered, and what must be abstained on cannot. Not every scenario admits every arm; `Rejected` says why. What
 an arm shows of a control it shows as if no panel closed it: it differs from the pair in what it takes away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from traps_pipeline.protocol.datasets import arms_of, sides_of
+from traps_pipeline.protocol.datasets import CROSSED, arms_of, sides_of
 from traps_pipeline.scenes.certification.certificates import (
     EARLIEST_CUT_S,
     legible_groups,
     settled_answer,
     shown_points,
 )
-from traps_pipeline.scenes.parts.offers import with_choices, without_choices
-from traps_pipeline.scenes.parts.wording import refutation
-from traps_pipeline.scenes.physics.kit import View
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.parts.wording import false_premise
+from traps_pipeline.scenes.physics.kit import Inventory, Physics, View
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import HEIGHT, PANEL_HALF_THICKNESS, WIDTH, Camera, Panel, fit_camera
+from traps_pipeline.scenes.picture.camera import PANEL_HALF_THICKNESS, Panel, fit_camera
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms, moving_geoms
+from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 
@@ -42,8 +42,6 @@ EARLIEST_COVER_S = 0.5  # the late panel comes no earlier
 AGREE_SHARE = 0.95  # of the futures of a predictable cut
 FUTURES = 64  # of the last frame that it shows
 LEADS = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
-BEYOND_PX = 4.0  # what is out of the frame is so far out of it
-SHADOW_FRAMES = 2
 BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
 
 
@@ -134,11 +132,6 @@ def must_answer(spec: SceneSpec) -> list[Question]:
     return [Question("control", spec.question, spec.ground_truth)]
 
 
-def must_abstain(spec: SceneSpec) -> list[Question]:
-    """The record's question of the arm's own clip, to be abstained on."""
-    return [Question("void", spec.question, None)]
-
-
 # --- a panel that hides nothing, or not for good ----------------------------------------------------------------------
 
 
@@ -218,58 +211,6 @@ def _late_panel(scenario: Scenario) -> Take:
     return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": differing})
 
 
-# --- no panel, and still nothing to be seen ---------------------------------------------------------------------------
-
-
-def _looking_past(camera: Camera, corners: np.ndarray) -> Iterator[Camera]:
-    """Cameras that stand a little to one side, so that all corners (N, 3) lie out of the frame."""
-    right, up, forward = camera.axes()
-    focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
-    depth = (corners - camera.position()) @ forward
-    x, y = camera.project(corners).T
-    shifts = (
-        (right, float(((x + BEYOND_PX) * depth / focal).max())),
-        (right, -float(((WIDTH + BEYOND_PX - x) * depth / focal).max())),
-        (up, -float(((y + BEYOND_PX) * depth / focal).max())),
-    )
-    for axis, by in shifts:
-        a, b, c = (round(float(value), 6) for value in np.array(camera.lookat) + by * axis)
-        yield replace(camera, lookat=(a, b, c))
-
-
-def _frame_out(scenario: Scenario) -> Take:
-    control, twin = scenario.control, scenario.twin
-    cover, commit = control.scene.cover, control.outcome.commit_frame
-    assert cover is not None, "an occlusion scene says what its panel must hide"
-    model, scene = compile_scene(control.family, control.params, control.physics)
-    other, _ = compile_scene(twin.family, twin.params, twin.physics)
-    decisive, hidden = decisive_geoms(model, scene.decisive), scene.hidden
-    moving = moving_geoms(model)
-    reason = "no camera was tried"
-    for camera in _looking_past(control.camera, cover.corners()):
-        with Renderer(model, camera) as renderer:
-            counts = renderer.visible_pixels(control.qpos, [*decisive, *hidden])
-            cause = float(renderer.visible_pixels(control.qpos[:1], moving).sum())
-            seen = checks.PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
-            first = seen.hidden_from()
-            if cause < SEEN_PX or first + SHADOW_FRAMES >= commit or seen.leaked(first):
-                reason = (
-                    reason if cause < SEEN_PX else f"the outcome shows for {first} frames, or {seen.leaked(first)} px"
-                )
-                continue
-            first += SHADOW_FRAMES  # a shadow leaves the frame after what throws it
-            traces = checks.ablation_pixels(renderer, control.qpos[first:], [*decisive, *hidden])
-            frames = list(renderer.frames(control.qpos))
-        with Renderer(other, camera) as renderer:
-            differing, _ = checks.differing_pixels(frames, renderer.frames(twin.qpos))
-        if traces or differing:
-            reason = f"{traces} pixels of shadow are seen, the twin differs in {differing}"
-            continue
-        evidence = {"cause_px": cause, "hidden_from_s": first / scenario.fps, "twin_px": differing}
-        return Take(frames, evidence | {"ablation_px": traces, "lookat": list(camera.lookat)})
-    raise Rejected(f"no camera sees something move and not the outcome ({reason})")
-
-
 # --- length -----------------------------------------------------------------------------------------------------------
 
 
@@ -282,13 +223,6 @@ def _length_matched(scenario: Scenario) -> Take:
     if seen != spec.ground_truth:
         raise Rejected(f"the observer sees {seen!r} in the last {len(frames)} frames, the answer is not")
     return Take(frames, {"frames": len(frames), "observed": seen})
-
-
-def _held_void(scenario: Scenario) -> Take:
-    """The void, its last frame held until the control ends."""
-    void = scenario.void_frames
-    held = len(scenario.control.qpos) - len(void)
-    return Take([*void, *[void[-1]] * held], {"held_s": held / scenario.fps})
 
 
 def _predictable_cut(scenario: Scenario) -> Take:
@@ -347,24 +281,57 @@ def _twin(scenario: Scenario) -> Take:
     return Take([], {"settled_s": scenario.twin.outcome.commit_frame / scenario.fps})
 
 
-def _choices_swapped(spec: SceneSpec) -> list[Question]:
-    plain, offering = without_choices(spec.question, tuple(spec.labels)), with_choices(spec.ill_posed_question)
-    if plain is None or offering is None:
-        which = spec.question if plain is None else spec.ill_posed_question
-        raise Rejected(f"the choices of {which!r} cannot be taken from it, or none are known for it")
-    return [
-        Question("control", plain, spec.ground_truth, clip="control"),
-        Question("void", offering, None, clip="control"),
-    ]
+def crossed(partner: SceneSpec | None) -> Arm:
+    """Return the arm that asks the void what it answers, and the control the question of the scenario's partner."""
+
+    def ask(spec: SceneSpec) -> list[Question]:
+        if partner is None:
+            raise Rejected("it has no partner: a scenario of its family whose scene and its own refute each other's")
+        aside = spec.answerable_question
+        return [
+            Question("control", aside.question, aside.answer, clip="void", labels=tuple(aside.labels)),
+            Question("void", partner.question, None, clip="control", labels=tuple(partner.labels)),
+        ]
+
+    def film(scenario: Scenario) -> Take:
+        foreign = ask(scenario.spec)[1].text
+        why = false_premise(foreign, scenario.control.inventory)
+        if why is None:
+            raise Rejected(f"the scene does not refute {foreign!r}")
+        return Take([], {"refuted_by": why})
+
+    return Arm(
+        CROSSED,
+        "this clip, or this question, means: abstain",
+        "the void with a question that it answers; the control with the question of its partner, which presumes a "
+        "colour that nothing in the scene has, as does its own question in the partner's scene",
+        ask,
+        film,
+    )
 
 
-def _words_alone(scenario: Scenario) -> Take:
-    spec = scenario.spec
-    void = next(question for question in _choices_swapped(spec) if question.side == "void")
-    why = refutation(spec.taxonomy, void.text, scenario.control.inventory)
-    if why is None:
-        raise Rejected(f"nothing shows that {void.text!r} has no answer")
-    return Take([], {"ill_posed_for": why})
+def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
+    """Return the partner of each scenario of a family that has one, by id.
+
+    The scenes of partners refute each other's question. So each question is asked in vain as often as it is answered.
+    Scenarios with the fewest candidates choose first, which leaves few without a partner.
+    """
+    by_id = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
+    seen = {id_: _inventory(spec) for id_, spec in by_id.items()}
+    refuted = {(a, b) for a in by_id for b in by_id if false_premise(by_id[b].question, seen[a]) is not None}
+    free = {a: {b for b in by_id if (a, b) in refuted and (b, a) in refuted} for a in by_id}
+    chosen: dict[str, str] = {}
+    while candidates := [a for a in free if free[a]]:
+        a = min(candidates, key=lambda one: len(free[one]))
+        b = min(sorted(free[a]), key=lambda one: len(free[one]))
+        chosen |= {a: b, b: a}
+        free = {one: others - {a, b} for one, others in free.items() if one not in (a, b)}
+    return chosen
+
+
+def _inventory(spec: SceneSpec) -> Inventory:
+    family = get_family(spec.family)
+    return family.build(family.params_from(spec.params), Physics(**spec.physics)).inventory
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------
@@ -419,31 +386,7 @@ ARMS: Mapping[str, Arm] = {
             _twin_answers,
             _twin,
         ),
-        Arm(
-            "frame_out",
-            "no panel means: answer",
-            "the camera looks past the outcome: what moves is seen at first with at least "
-            f"{SEEN_PX:.0f} pixels, then no decisive body, the hidden element never, no shadow of either, and the twin "
-            "has the same frames byte for byte",
-            must_abstain,
-            _frame_out,
-        ),
-        Arm(
-            "held_void",
-            "a long clip means: answer",
-            "the void's frames, the last one held until the control's length: nothing is shown that the void does not "
-            "show",
-            must_abstain,
-            _held_void,
-        ),
-        Arm(
-            "choices_swapped",
-            "a question without choices means: abstain",
-            "the control with its question, whose choices are taken away, and with its ill-posed question, which "
-            "offers some: the vocabulary still refutes it",
-            _choices_swapped,
-            _words_alone,
-        ),
+        crossed(None),
     )
 }
 

@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.wording import asked, choices_in
 from traps_pipeline.scenes.physics.kit import listed
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
+from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_answer
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, moving_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
@@ -78,6 +78,10 @@ def _both(question: str, answer: str, labels: tuple[str, ...] | None = None) -> 
         Question("control", question, answer, "control", labels),
         Question("void", question, None, "void", labels),
     ]
+
+
+def _must_abstain(spec: SceneSpec) -> list[Question]:
+    return [Question("void", spec.question, None)]
 
 
 def _pair(spec: SceneSpec) -> list[Question]:
@@ -243,7 +247,7 @@ def _variation(name: str) -> Arm:
         return Arm(name, changes, promise, _labels(count), _offered)
     if name in PANEL_LOOKS:
         promise = _FAINT_VOID if name == "panel_alpha_95" else _SAME_VOID
-        return Arm(name, _CHANGES[name], promise, must_abstain, _FILMED[name])
+        return Arm(name, _CHANGES[name], promise, _must_abstain, _FILMED[name])
     if name in PANEL_DOSES:
         return Arm(name, f"the panel has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, must_answer, _sheer(_ALPHAS[name]))
     promises = {

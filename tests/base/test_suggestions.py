@@ -1,0 +1,21 @@
+"""The nearest known word to a misspelt one."""
+
+from __future__ import annotations
+
+import pytest
+
+from traps_pipeline.base.suggestions import did_you_mean, nearest
+
+KNOWN = ("gpt-5-mini", "oracle", "always-abstain")
+
+
+@pytest.mark.parametrize(
+    ("word", "near"), [("orcale", "oracle"), ("GPT5-mini", "gpt-5-mini"), ("abstain", "always-abstain"), ("zzz", None)]
+)
+def test_a_word_is_like_one_of_the_known_or_like_none(word: str, near: str | None) -> None:
+    assert nearest(word, KNOWN) == near
+    assert did_you_mean(word, KNOWN) == (f"; did you mean {near}?" if near else "")
+
+
+def test_a_word_of_any_length_is_compared_at_once() -> None:
+    assert nearest("o" * 1_000_000, KNOWN) is None

@@ -1,0 +1,88 @@
+"""Commands in groups: help with examples, suggestions for misspelt words, completion in a shell."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from tests.commands_page import PAGE, page
+from tests.conftest import ROOT
+from traps_pipeline.cli import GROUPS, build_parser, main
+from traps_pipeline.cli.command import SHORT
+
+COMMANDS = sorted(build_parser().commands)
+
+
+@pytest.mark.parametrize("path", COMMANDS)
+def test_the_example_of_a_help_text_can_be_given_as_it_stands(path: str) -> None:
+    text = build_parser().commands[path].format_help()
+    (example,) = (line for line in text.splitlines() if line.startswith("example: traps "))
+    parsed = build_parser().parse_args(shlex.split(example.removeprefix("example: traps ")))
+    assert parsed.parser.prog == f"traps {path}"
+    assert "exit codes: 0 done, 1 something failed, 2 bad usage, " in text
+    assert ("4 a budget is reached" in text) == (path == "study run")
+
+
+def test_every_command_but_completion_stands_in_a_group_and_daily_ones_need_none() -> None:
+    assert {path.split()[0] for path in COMMANDS} == {*GROUPS, "completion"}
+    for name, group in SHORT.items():
+        words = ["demo"] if name in ("plan", "run") else ["a:b:c"] if name == "why" else []
+        assert build_parser().parse_args([name, *words]).parser.prog == f"traps {group} {name}"
+
+
+def test_no_command_shows_where_to_start_and_a_group_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "traps run demo" in capsys.readouterr().out
+    assert main(["people"]) == 0
+    assert "label clips and answers blindly" in " ".join(capsys.readouterr().out.split())
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("traps 0.")
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["sttaus"], "did you mean `traps status`?"),
+        (["certify"], "did you mean `traps benchmark certify`?"),
+        (["reslts"], "did you mean `traps results`?"),
+        (["study", "expot-votes"], "did you mean `traps study export-votes`?"),
+        (["zzz"], "unknown command 'zzz'; `traps --help` lists them"),
+        (["run", "demo", "--budgt-usd", "3"], "did you mean --budget-usd?"),
+        (["run", "demo", "--progress", "jsn"], "did you mean json?"),
+    ],
+)
+def test_a_misspelt_word_is_bad_usage_with_the_nearest_one(
+    words: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert hint in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("traps stu", "study"),
+        ("traps study pl", "plan"),
+        ("traps run hyp", "hypotheses hypotheses-pocket"),
+        ("traps study run demo --unt", "--until"),
+        ("traps publish ver", "verify"),
+    ],
+)
+def test_a_shell_completes_commands_options_and_experiments(words: str, expected: str) -> None:
+    script = subprocess.run(
+        [sys.executable, "-m", "traps_pipeline.cli", "completion", "bash"], cwd=ROOT, capture_output=True, text=True
+    ).stdout
+    asked = f"COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _traps; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr) == (expected, "")
+
+
+def test_the_page_of_commands_is_what_the_parser_says_and_every_argument_has_a_meaning() -> None:
+    text = page()
+    assert PAGE.read_text(encoding="utf-8") == text  # `python -m tests.commands_page` writes it
+    assert not [line for line in text.splitlines() if line.startswith("| `") and line.split("|")[2].strip() == ""]

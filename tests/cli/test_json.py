@@ -1,0 +1,63 @@
+"""`--json`: what a command prints, for a program that reads it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.conftest import EXPERIMENT, Checkout
+from traps_pipeline.cli.command import print_json
+
+ITEM = "occlusion:domino_chain-0001:void"
+
+
+@dataclass
+class Pair:
+    """Two values."""
+
+    first: Any
+    second: Any
+
+
+def read(study: Checkout, *arguments: str) -> Any:
+    """Return the JSON that a command prints."""
+    finished = study.traps(*arguments, "--json")
+    assert finished.code == 0, finished.err
+    return json.loads(finished.out)
+
+
+def test_what_is_missing_is_null_and_tables_are_lists_of_rows(capsys: pytest.CaptureFixture[str]) -> None:
+    frame = pd.DataFrame({"model": ["a", "b"], "pecs": [0.5, math.nan]})
+    print_json({"board": frame, 3: Pair(np.int64(7), Path("/x")), "inf": math.inf, "set": {1}})
+    assert json.loads(capsys.readouterr().out) == {
+        "board": [{"model": "a", "pecs": 0.5}, {"model": "b", "pecs": None}],
+        "3": {"first": 7, "second": "/x"},
+        "inf": None,
+        "set": [1],
+    }
+
+
+def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
+    plan = read(small, "plan", EXPERIMENT)
+    assert plan["plan"]["calls"]["oracle"][0] == {"wanted": 96, "known": 96}
+    why = read(small, "why", ITEM)
+    assert why["item"] == ITEM and {"evaluation", "state", "answers", "votes"} == {*why["evaluations"][0]}
+    run = read(small, "run", EXPERIMENT)
+    assert {row["model"] for row in run["leaderboard"]} == {"oracle", "always-abstain", "prior"}
+    assert run["run"]["problems"] == []
+    status = read(small, "status", EXPERIMENT)
+    assert status["checks"] == [] and status["command"] == f"traps run {EXPERIMENT}"
+    assert not any(row["stale"] or row["missing"] for row in status["stages"])
+
+
+def test_findings_and_differences_are_rows(small: Checkout) -> None:
+    assert {"statement", "published", "recomputed", "verdict"} <= {*read(small, "results", "audit")[0]}
+    difference = read(small, "results", "compare", str(small.workspace))[0]
+    assert difference["difference"] == 0.0

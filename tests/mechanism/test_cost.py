@@ -1,0 +1,70 @@
+"""What local models cost, worked out by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from traps_pipeline.cli import main
+from traps_pipeline.mechanism.cost import Card, Work, cost_of, passes_inside
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.media import MediaSpec
+from traps_pipeline.storage.study import MechanismSettings
+
+CARD = Card(operations=1e15, bandwidth=1e12)
+
+
+def entry(**other: object) -> ModelEntry:
+    params = {"checkpoint": "a/b", "dtype": "bfloat16", "quantisation": "none", "do_sample": False}
+    about = {"id": "m", "backend": "local", "device": "cuda", "media": {"profile": "frames", "uniform": 10}}
+    size = {"parameters_b": 5.0, "layers": 10, "width": 1000}
+    return ModelEntry.model_validate(
+        about | {"params": params | {"max_new_tokens": 9}, "tokens_per_frame": 78, "size": size} | other
+    )
+
+
+def test_the_passes_of_the_papers_study_are_counted() -> None:
+    settings = MechanismSettings.model_validate(
+        {
+            "models": {"m": {"steering": 1, "centroid": 1}},
+            "patching": {"pairs": 50, "exact": 24},
+            "gate": {"untrained": True},
+        }
+    )
+    scenarios = {"occlusion": 202, "chaotic": 500}
+    passes = {work.kind: work.passes for work in passes_inside(settings, DATASETS, scenarios)}
+    assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202 + 2 * 500
+    assert passes["states of random weights"] == 4 * 202 + 4 * 500 + 202 + 2 * 500
+    # Two directions of 100 pairs: 2 records and a gradient (3); 1 + 4 records; 4 sources x (24 + 1) rows of half a pass
+    assert passes["patching"] == 2 * 100 * (5 + 5 + 50)
+    few = passes_inside(settings, ["chaotic"], {"chaotic": 3, "occlusion": 202})[0]
+    assert few.passes == 2 * (2 * 3) + 2 * 3
+
+
+def test_hours_and_gigabytes_follow_from_parameters_tokens_and_the_card() -> None:
+    media = MediaSpec(profile="frames", uniform=10)
+    states = cost_of(entry(), media, Work("states", 720), CARD, quantised=False)
+    assert states.tokens_in == 720 * 1000  # 10 frames of 78 tokens, and 220 of text
+    assert states.hours == pytest.approx(2 * 5e9 * 720e3 / 0.4e15 / 3600)
+    assert states.gigabytes == pytest.approx(10 + 28 * 1000 * 1000 * 2 / 1e9)
+    answers = cost_of(entry(), media, Work("answers", 640, 100), CARD, quantised=False)
+    steps = 640 * 100 / 64 * 0.010  # reading 10 GB takes 10 ms, launching ten blocks 7 ms
+    assert answers.hours == pytest.approx((2 * 5e9 * 640e3 / 0.4e15 + steps) / 3600)
+    packed = cost_of(entry(), media, Work("patching", 720), CARD, quantised=True)
+    assert packed.hours == pytest.approx(2 * states.hours)
+    assert packed.gigabytes == pytest.approx(3 + (4 * 10 + 2 + 18 * 10) * 2e6 / 1e9)
+
+
+def test_frames_are_those_that_a_clip_of_five_seconds_has() -> None:
+    media = MediaSpec(profile="frames", fps=2, most=32)
+    assert cost_of(entry(), media, Work("states", 1), CARD, quantised=False).tokens_in == 10 * 78 + 220
+
+
+def test_without_a_size_tokens_are_known_and_hours_are_not() -> None:
+    cost = cost_of(entry(size=None), MediaSpec(profile="frames", uniform=10), Work("states", 5), CARD, quantised=False)
+    assert (cost.tokens_in, cost.hours, cost.gigabytes) == (5000, None, None)
+
+
+def test_a_card_that_is_not_known_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "demo", "--card", "abacus"]) != 0
+    assert "--card abacus: name one of H100, A100" in capsys.readouterr().err

@@ -1,0 +1,22 @@
+"""The nearest of the known words to one that is unknown, for error messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+_LIKENESS = 0.6
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that is most like this one, or None where none is like it."""
+    from difflib import get_close_matches
+
+    names = {name.lower(): name for name in known}
+    near = get_close_matches(word.lower()[:100], names, n=1, cutoff=_LIKENESS)
+    return names[near[0]] if near else None
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return the end of a sentence that suggests the nearest known word, or nothing."""
+    near = nearest(word, known)
+    return f"; did you mean {near}?" if near else ""

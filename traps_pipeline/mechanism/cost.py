@@ -1,0 +1,102 @@
+"""What local models cost, for `traps plan`: passes, tokens, hours of a named GPU, and memory.
+
+Arithmetic, not measurement: a pass takes 2 operations a parameter and token, and steps of decoding are bound by the
+launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
+from traps_pipeline.storage.media import MediaSpec
+from traps_pipeline.storage.study import MechanismSettings
+
+TEXT_TOKENS = 220  # system prompt, question and chat template
+CLIP_S = 5.0
+REACHED = 0.4  # of a card's operations, by passes over prompts
+STEP_S = 0.7e-3  # of a block in a step of decoding, however many rows
+NF4_TIMES = 2.0  # as long, since weights are unpacked at every use
+NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # a parameter
+ROWS = 64  # of a batch of answers
+WIDEST = 28  # numbers a token and unit of width in a block's widest moment
+GRAPH = 18  # numbers a token, block and unit of width that a backward pass keeps
+SOURCES = 4  # of a patch: the other side, and three nulls
+
+
+@dataclass(frozen=True)
+class Card:
+    """A GPU by its data sheet: dense operations a second in bfloat16, and bytes a second from its memory."""
+
+    operations: float
+    bandwidth: float
+
+
+CARDS = {
+    "H100": Card(989e12, 3.35e12),
+    "A100": Card(312e12, 2.0e12),
+    "L40S": Card(362e12, 0.86e12),
+    "RTX4090": Card(165e12, 1.0e12),
+}
+
+
+@dataclass(frozen=True)
+class Work:
+    """New work of one kind: passes over prompts, and answers with so many tokens each (0: none are generated)."""
+
+    kind: str
+    passes: float
+    answer_tokens: int = 0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one kind of work takes of one model. hours, gigabytes: None where the entry names no `size`."""
+
+    model: str
+    kind: str
+    passes: int
+    tokens_in: float
+    tokens_out: float
+    hours: float | None
+    gigabytes: float | None
+
+
+def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
+    """Return the passes of states, of the untrained network and of patching. scenarios: their number by taxonomy."""
+    paired = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
+    beside = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
+    beside += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
+    beside += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
+    work = [Work("states", len(settings.prompts) * paired + beside)]
+    if settings.gate.untrained:
+        work.append(Work("states of random weights", paired + beside))
+    if settings.patching is not None:
+        pairs = sum(min(settings.patching.pairs, scenarios.get(name, 0)) for name in ("occlusion", "chaotic"))
+        estimate = 2 + 3  # two recorded passes; one with gradients takes three times as long
+        patches = 1 + SOURCES + SOURCES * (settings.patching.exact + 1) / 2  # a patched pass runs half of the blocks
+        work.append(Work("patching", len(SIDES) * pairs * (estimate + patches)))
+    return work
+
+
+def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quantised: bool) -> Cost:
+    """Return what work takes of a model that is shown clips so. quantised: whether its weights are in NF4."""
+    frames = media.uniform or min(media.most, round((media.fps or 1) * CLIP_S))
+    prompt = frames * entry.tokens_per_frame + TEXT_TOKENS
+    tokens_in, tokens_out = work.passes * prompt, work.passes * work.answer_tokens
+    passes = round(work.passes)
+    if entry.size is None:
+        return Cost(entry.id, work.kind, passes, tokens_in, tokens_out, None, None)
+    parameters, layers, width = entry.size.parameters_b * 1e9, entry.size.layers, entry.size.width
+    weights = parameters * (NF4_BYTES if quantised else BFLOAT16_BYTES)
+    seconds = 2 * parameters * tokens_in / (REACHED * card.operations)
+    seconds += tokens_out / ROWS * max(layers * STEP_S, weights / card.bandwidth)
+    state = prompt * width * BFLOAT16_BYTES  # of one layer
+    extra = (4 * layers + 2 + GRAPH * layers) * state if work.kind == "patching" else WIDEST * state
+    return Cost(
+        entry.id, work.kind, passes, tokens_in, tokens_out,
+        hours=seconds * (NF4_TIMES if quantised else 1.0) / 3600,
+        gigabytes=(weights + extra) / 1e9,
+    )  # fmt: skip

@@ -1,0 +1,86 @@
+"""The output side in whole sentences: how likely an abstention is to the model, beside the answer that it gave.
+
+The output margin is of the first answer token, and a model that begins every answer with "The" shows nothing there.
+Here every sentence of a set, and the model's own answer, is put behind the benchmark's prompt (teacher forcing), and
+its tokens' log-probabilities are averaged, so that long and short sentences are comparable. One pass a sentence.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.mechanism.control_rows import SentenceRow
+from traps_pipeline.mechanism.margin import head_logits
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
+from traps_pipeline.mechanism.stages import probed_item
+from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import LocalModel, Prompt
+
+OWN_TOKENS = 64  # of the model's own answer, from its beginning
+
+
+def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[SentenceRow]:
+    """Return the rows of SENTENCES: every item of the pairs under the benchmark's prompt of the extraction's name, with
+    the model's answer of run 1. Raises TrapsError for a model that was not asked under that prompt."""
+    from traps_pipeline.models.local.adapter import load_local_model
+
+    assert entry.media is not None, "local entries have media"
+    model, regime, rows = load_local_model(entry, inside=True), extraction.prompt, list[SentenceRow]()
+    sentences = {text: answer_tokens(model, text) for text in workspace.mechanism.sentences}
+    for dataset in DATASETS:
+        cell = Cell(dataset, Evaluation(entry.id, regime, 1))
+        if workspace.tables.state(RESPONSES, cell.partition) is None:
+            continue
+        texts = workspace.tables.read(RESPONSES, cell.partition).set_index("item_id")["text"].to_dict()
+        items = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}).to_dict("records")
+        for number, item in enumerate(items, start=1):
+            progress.current().tick("sentences", f"items of {cell.key}", number, len(items))
+            about = {str(name): value for name, value in item.items()}
+            prompt = probed_item(workspace, model, entry.media, about, system_prompt(regime)).prompt()
+            text = texts.get(about["item_id"])
+            own = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
+            with model.remembering_clips():
+                likely = {name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()}
+                answer = mean_log_probability(model, prompt, own) if own else None
+            best = max(likely, key=lambda name: likely[name])
+            rows.append(
+                SentenceRow(
+                    **extraction.partition,
+                    **{name: about[name] for name in ("item_id", "dataset", "scenario_id", "side")},
+                    sentence=best,
+                    abstention=likely[best],
+                    own=answer,
+                    own_tokens=len(own),
+                )
+            )
+    if not rows:
+        raise TrapsError(
+            f"sentences {extraction.key}: {entry.id} was not asked under {regime} in run 1; ask it, or set "
+            "`mechanism.sentences: []` in the experiment and in study.yaml"
+        )
+    return rows
+
+
+def answer_tokens(model: LocalModel, text: str) -> list[int]:
+    """Return the tokens of a text as an answer."""
+    return model.processor.tokenizer(text, add_special_tokens=False).input_ids
+
+
+def mean_log_probability(model: LocalModel, prompt: Prompt, tokens: list[int]) -> float:
+    """Return the mean log-probability (nats a token) of tokens behind a prompt, in one pass of batch size 1."""
+    import torch
+
+    forced = prompt.followed_by(tokens)
+    with torch.inference_mode():
+        states = model.forward(forced).last_hidden_state[0, -len(tokens) - 1 : -1]
+        chances = head_logits(model, states).log_softmax(-1)
+        return float(chances[torch.arange(len(tokens)), torch.tensor(tokens)].mean())
