@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -142,7 +142,7 @@ def decisions(items: pd.DataFrame, held_out: str, folds: int) -> dict[str, np.nd
     ill_posed = void & items["dataset"].str.endswith("_ill_posed").to_numpy()
     clip, groups = items.filter(regex=r"^f\d+$").to_numpy(float), items[held_out].to_numpy()
     words = CountVectorizer(ngram_range=(1, 2), binary=True, max_features=WORDS)
-    text = np.asarray(words.fit_transform(items["question"]).todense(), float)
+    text = cast(Any, words.fit_transform(items["question"])).toarray().astype(float)
     abstains = {rule: np.zeros(len(items), bool) for rule in RULES}
     for train, test in GroupKFold(min(folds, len(set(groups)))).split(clip, groups=groups):
         # Crossed items contradict either classifier alone; each learns its own reason to abstain.

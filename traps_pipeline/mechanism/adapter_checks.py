@@ -216,7 +216,7 @@ def _batches(subject: Subject) -> str:
 
 @contextmanager
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
-    """Inside, a token that an answer has early ends answers, so that rows leave their batch."""
+    """Inside, a token that an answer has early ends answers, so that rows of a batch end at different tokens."""
     config = model.network.generation_config
     before, config.eos_token_id = config.eos_token_id, [token]
     try:
@@ -233,7 +233,7 @@ CHECKS = (
     Check("means", "the mean over the question's tokens is that of the library's states", _pooled),
     Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _patching),
     Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
-    Check("batches", "answers do not depend on their batch, nor on rows that leave it", _batches),
+    Check("batches", "answers do not depend on their batch, nor on rows that end early", _batches),
 )
 
 

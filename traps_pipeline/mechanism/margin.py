@@ -58,13 +58,15 @@ def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) 
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
-    """The margins (n,) of states (n, d) that left the final norm at the last position of a prompt, on the CPU."""
+    """Return the margins (n,) of states (n, d) that left the final norm at the last position of a prompt, on the CPU.
+
+    Gradients pass: `patching_effects.attributed_changes` asks for them.
+    """
     import torch
 
-    with torch.inference_mode():
-        states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
-        never = model.network.generation_config.suppress_tokens or ()
-        return margin_of(head_logits(model, states), tokens, never).cpu()
+    states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
+    never = model.network.generation_config.suppress_tokens or ()
+    return margin_of(head_logits(model, states), tokens, never).cpu()
 
 
 def head_logits(model: LocalModel, normed: Tensor) -> Tensor:

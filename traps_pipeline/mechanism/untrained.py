@@ -33,7 +33,11 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
             trained.network.config, dtype=trained.network.dtype
         )
     return LocalModel(
-        network.to(trained.device).eval(), trained.processor, trained.checkpoint, trained.params, trained.device
+        network.to(trained.inputs_device).eval().requires_grad_(False),
+        trained.processor,
+        trained.checkpoint,
+        trained.params,
+        trained.device,
     )
 
 

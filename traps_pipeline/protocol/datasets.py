@@ -31,8 +31,8 @@ ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
 # Datasets that change one thing of the pairs, step by step, for what the paper supposes and did not measure
 # (docs/hypotheses.md). No part of PECS or of the arms' figures; asked on request.
 LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
-PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_large", "panel_alpha_95")  # still voids
-PANEL_DOSES = ("panel_alpha_80", "panel_alpha_50")  # the panel lets the outcome through: no voids
+PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_large")  # still voids
+PANEL_DOSES = ("panel_alpha_50",)  # the panel lets the outcome through: no voids
 SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
 FRAMINGS = ("frames_later", "frames_few", "frames_all")
 VARIATIONS = (*LABEL_DOSES, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)

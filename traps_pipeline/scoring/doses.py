@@ -81,8 +81,6 @@ HYPOTHESES = (
             _void("grey", "panel_grey"),
             _void("magenta", "panel_magenta"),
             _void("large", "panel_large"),
-            Dose("alpha 0.95", ("panel_alpha_95",), "void", "void: at most 7 of 255 levels show through"),
-            _no_void("alpha 0.8", "panel_alpha_80"),
             _no_void("alpha 0.5", "panel_alpha_50"),
         ),
     ),

@@ -36,10 +36,6 @@ class SeededNucleus:
         self._sampling = sampling
         self._streams = [np.random.default_rng(seed) for seed in sampling.seeds]
 
-    def keep(self, rows: Sequence[int]) -> None:
-        """Go on with some of the rows, each in its own stream."""
-        self._streams = [self._streams[row] for row in rows]
-
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
         """scores: (rows, vocabulary) logits; the same shape comes back."""
         import torch

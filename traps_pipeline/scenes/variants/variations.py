@@ -124,8 +124,7 @@ def _renderer(world: World, look: Look) -> Renderer:
 
 
 def _void_with(scenario: Scenario, look: Look) -> Take:
-    """The void with another panel, if nobody can tell it from the other world's: an opaque panel must give the same
-    frames byte for byte, another one frames of which no pixel differs by NOTICED levels. Raises Rejected."""
+    """Return the void with another panel, if the other world gives the same frames byte for byte. Raises Rejected."""
     control, twin = scenario.control, scenario.twin
     moving = moving_geoms(control.model)
     with _renderer(control, look) as renderer:
@@ -134,11 +133,11 @@ def _void_with(scenario: Scenario, look: Look) -> Take:
         cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, panel=True).sum(axis=1).max())
     with _renderer(twin, look) as renderer:
         differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
-    if levels >= (1 if look.alpha == 1 else NOTICED):
+    if differing:
         raise Rejected(f"behind this panel the two worlds differ in {differing} pixels, by {levels} levels at most")
     if cause < SEEN_PX:
         raise Rejected(f"past this panel at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted")
-    evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing, "twin_levels": levels}
+    evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing}
     looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
@@ -208,23 +207,17 @@ _SAME_VOID = (
     "the other world behind the void gives the same frames byte for byte, at every frame; at least "
     f"{SEEN_PX:.0f} pixels of what moves are seen past the panel in some sampled frame"
 )
-_FAINT_VOID = (
-    f"a void to the eye, not byte for byte: in no frame does a pixel of the other world's differ by {NOTICED} of 255 "
-    "levels or more; what moves is seen as above"
-)
 _SEEN_THROUGH = (
     f"not a void: in one of the last three sampled frames the two worlds differ by {NOTICED} of 255 levels or more in "
     f"at least {SEEN_PX:.0f} pixels"
 )
 _COUNTS = {"labels_two": 2, "labels_three": 3, "labels_six": 6}
 _COLOURED = {"panel_grey": GREY, "panel_magenta": MAGENTA}
-_FAINT = 0.95
 _ALPHAS = {name: int(name.removeprefix("panel_alpha_")) / 100 for name in PANEL_DOSES}
 _CHANGES: Mapping[str, str] = {
     "panel_grey": "the panel is grey, near the floor's colour",
     "panel_magenta": "the panel is magenta, which nothing in any scene is",
     "panel_large": f"the panel is {WIDER:g} times as wide",
-    "panel_alpha_95": f"the panel has alpha {_FAINT:g}",
     "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
     "schema_reason": 'it asks for `{"reason", "final_answer"}`: the request of the regime `json`',
     "schema_abstain": 'it asks for `{"reason", "abstain", "final_answer"}`',
@@ -235,7 +228,6 @@ _CHANGES: Mapping[str, str] = {
 _FILMED: Mapping[str, Callable[[Scenario], Take]] = {
     **{name: _coloured(colour) for name, colour in _COLOURED.items()},
     "panel_large": _large,
-    "panel_alpha_95": lambda scenario: _void_with(scenario, Look(alpha=_FAINT)),
 }
 
 
@@ -246,8 +238,7 @@ def _variation(name: str) -> Arm:
         promise = "the true answer and the other world's are always offered; asked with 2, 3 and 6 or not at all"
         return Arm(name, changes, promise, _labels(count), _offered)
     if name in PANEL_LOOKS:
-        promise = _FAINT_VOID if name == "panel_alpha_95" else _SAME_VOID
-        return Arm(name, _CHANGES[name], promise, _must_abstain, _FILMED[name])
+        return Arm(name, _CHANGES[name], _SAME_VOID, _must_abstain, _FILMED[name])
     if name in PANEL_DOSES:
         return Arm(name, f"the panel has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, must_answer, _sheer(_ALPHAS[name]))
     promises = {
