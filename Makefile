@@ -19,7 +19,6 @@ help: ## what make can do here
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
-	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps site
 
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
 	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism

@@ -1,5 +1,5 @@
 # What maintainers do: measurements, locks, releases, other libraries. Included by the Makefile, whose variables it uses.
-.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-vendor wheel sbom release-check environments
+.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-check explorer-vendor wheel sbom release-check environments
 
 # Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
 test-newest: VENV := .workspaces/newest
@@ -48,6 +48,9 @@ bench-cluster: cluster-setup ## what a cluster costs and gains, against one mach
 
 explorer-vendor: ## the explorer's libraries, after a version in its package.json was changed; the bundle is checked in
 	cd traps_pipeline/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
+
+explorer-check: ## types and style of the pages' scripts; needs npm and its index
+	npm exec --yes --ignore-scripts --package=typescript@7.0.2 --package=eslint@10.15.0 -- traps_pipeline/explorer/web/vendor/check.sh
 
 lock: ## the locks from pyproject.toml, with uv
 	$(PYTHON) tools/lock.py $(LOCK_OPTIONS)

@@ -1,4 +1,4 @@
-"""A cell of 100,000 items: time and peak memory of each stage from answers to metrics, and of its item pages.
+"""A cell of 100,000 items: time and peak memory of each stage from answers to metrics, and of the explorer.
 
 The items are those of a small study many times over, under names of their own, so that nothing is rendered; a reference
 model answers and rules judge. Each stage is a process of its own, and so is what multiplies: a child's peak as the
@@ -24,15 +24,13 @@ from bench.quick import parse  # noqa: E402
 
 CELL = "chaotic|random-50__standard__run1"
 STAGES = {"responses": CELL, "votes": CELL, "verdicts": CELL, "metrics": "chaotic"}
-PAGE = """
-import os, sys
+SITE = """
+import os
 from pathlib import Path
-from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.report.cell_pages import item_pages
+from traps_pipeline.explorer.site import site_files
 from traps_pipeline.storage.workspace import Workspace
-workspace = Workspace.open(Path(os.environ["TRAPS_WORKSPACE"]))
-sizes = [len(page) for page in item_pages(workspace, Cell.parse(sys.argv[1]), None)]
-print(f"{len(sizes)} pages, {sum(sizes) / 1e6:.0f} MB of HTML, {max(sizes) / 1e6:.1f} MB the largest")
+files = site_files(Workspace.open(Path(os.environ["TRAPS_WORKSPACE"])))
+print(f"{len(files)} files, {sum(map(len, files.values())) / 1e6:.0f} MB")
 """
 
 
@@ -88,8 +86,8 @@ def main() -> None:
             command = ("-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage)
             seconds, gigabytes = run(study.environment, *command, "--partition", key)
             print(f"{stage:10s} {seconds:7.1f} s {gigabytes:5.2f} GB", flush=True)
-        seconds, gigabytes = run(study.environment, "-c", PAGE, CELL)
-        print(f"{'item pages':10s} {seconds:7.1f} s {gigabytes:5.2f} GB")
+        seconds, gigabytes = run(study.environment, "-c", SITE)
+        print(f"{'explorer':10s} {seconds:7.1f} s {gigabytes:5.2f} GB")
 
 
 if __name__ == "__main__":

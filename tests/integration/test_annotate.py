@@ -222,7 +222,7 @@ def check_tables(study: Checkout, knowing: Knowing) -> None:
     workspace = Workspace.open(study.workspace)
     before = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
     assert before[0].startswith("people: not run") and before[1].startswith("the panel: not validated")
-    ran = study.traps("run", EXPERIMENT, "--until", "report_tables")
+    ran = study.traps("run", EXPERIMENT, "--until", "report_page")
     assert ran.code == 0, ran.err
     assert ran.counts() == {"answers": 0, "votes": 0, "frames": 0}
     labels = workspace.tables.read(HUMAN_LABELS, {})

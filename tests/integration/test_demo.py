@@ -75,3 +75,8 @@ def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
         rows = workspace.tables.read_all(table)
         assert rows.empty == (table.name in {*NOT_RUN, *MECHANISM, *PEOPLE, *ON_REQUEST}), table.name
         assert set(rows.get("benchmark_version", ())) <= {load_release().version}, table.name
+
+
+def test_the_pages_of_the_demo_are_few_and_small(demo: Checkout) -> None:
+    files = [path for path in (demo.workspace / "reports").rglob("*") if path.is_file()]
+    assert len(files) <= 30 and sum(path.stat().st_size for path in files) <= 6e6

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 from scipy.stats import binomtest
@@ -22,7 +23,7 @@ from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
 from tests.pages import patient, until
 from traps_pipeline.explorer.site import write_site
-from traps_pipeline.judging.judging_rows import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboards
 from traps_pipeline.report.published_results import PublishedResults
@@ -266,7 +267,11 @@ def test_a_confabulation_is_found_in_three_clicks_and_its_clips_play_in_step(
 def test_filters_and_search_find_exactly_what_the_tables_hold(site: Site, browser: Browser) -> None:
     responses = site.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "side", "text"])
     verdicts = site.workspace.tables.read_all(VERDICTS, ["item_id", "model", "regime", "abstained"])
-    rows = responses.merge(verdicts, on=["item_id", "model", "regime"])
+    votes = site.workspace.tables.read_all(VOTES, ["item_id", "model", "regime", "rationale"])
+    key = ["item_id", "model", "regime"]
+    rationales = votes.groupby(key)["rationale"].agg(lambda texts: "\n".join(texts.dropna())).reset_index()
+    rows = responses.merge(verdicts, on=key).merge(rationales, on=key, how="left")
+    rows["said"] = rows["text"] + "\n" + rows["rationale"].fillna("")
     with visit(browser, site.address) as visited:
         page = visited.go("#/answers")
         assert page.locator(".status").inner_text() == f"{len(rows)} of {len(rows)} answers"
@@ -275,12 +280,20 @@ def test_filters_and_search_find_exactly_what_the_tables_hold(site: Site, browse
         page.get_by_label("Answer").select_option("answered")
         fits = rows["model"].eq("random-50") & rows["side"].eq("void") & rows["abstained"].eq(False)
         until(page, f"document.querySelector('.status').textContent.startsWith('{fits.sum()} of')")
-        page.get_by_role("searchbox").fill("The Answer is: LEFT")
+        first, second, *_, last = str(rows.loc[fits, "text"].iloc[0]).strip(".").split()
+        query = f'{last.upper()} "{first} {second}"'  # in any order, what is quoted together
+        page.get_by_role("searchbox").fill(query)
         page.keyboard.press("Enter")
-        wanted = int((fits & rows["text"].str.contains("the answer is: left", case=False, regex=False)).sum())
+        said = rows["said"].str.lower()
+        held = [said.str.contains(term.lower(), regex=False) for term in (last, f"{first} {second}")]
+        wanted = int((fits & held[0] & held[1]).sum())
+        assert wanted > 0
         until(page, "/ mention /.test(document.querySelector('.status').textContent)")
-        assert page.locator(".status").inner_text() == f"{wanted} of {fits.sum()} answers mention “The Answer is: LEFT”"
-        assert page.locator(".answer mark").count() == min(wanted, 25)
+        assert page.locator(".status").inner_text() == f"{wanted} of {fits.sum()} answers mention “{query}”"
+        assert page.locator(".answer", has=page.locator("mark")).count() == min(wanted, 25)
+        page.get_by_role("searchbox").fill("left nowhere")
+        page.keyboard.press("Enter")
+        page.get_by_text("No answer holds all these words").wait_for()
 
 
 def test_the_keyboard_reaches_a_pair_and_moves_through_its_neighbours(site: Site, browser: Browser) -> None:
@@ -296,26 +309,107 @@ def test_the_keyboard_reaches_a_pair_and_moves_through_its_neighbours(site: Site
                 break
         listed = page.locator(".answer a").all_inner_texts()
         page.keyboard.press("Enter")
-        until(page, f"document.querySelector('h1').textContent === '{listed[0]}'")
+        until(page, f"document.querySelector('.lead b')?.textContent === '{listed[0]}'")
         assert page.evaluate("document.activeElement.tagName") == "H1"
         until(page, "[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
         page.keyboard.press("ArrowRight")
         page.keyboard.press("ArrowRight")
         assert "frame 3 of" in page.locator("output").inner_text()
+        page.get_by_role("button", name="Play").click()  # which now has the focus
+        page.keyboard.press("ArrowLeft")
+        assert page.locator("button", has_text="Play").count() == 1  # it stopped
         page.keyboard.press("]")
-        until(page, f"document.querySelector('h1').textContent === '{listed[1]}'")
+        until(page, f"document.querySelector('.lead b')?.textContent === '{listed[1]}'")
         page.keyboard.press("[")
-        until(page, f"document.querySelector('h1').textContent === '{listed[0]}'")
+        until(page, f"document.querySelector('.lead b')?.textContent === '{listed[0]}'")
 
 
 @pytest.mark.parametrize("width", [390, 1280])
 def test_no_view_is_wider_than_the_screen(site: Site, browser: Browser, width: int) -> None:
     pair = "#/pair/occlusion/hidden_race-0001?model=random-50&regime=standard&run=1&model2=prior&regime2=json"
     with visit(browser, site.address, width) as visited:
-        for view in ("#/", "#/?paper=1", "#/model/prior", "#/matrix", "#/compare", "#/answers", pair):
+        views = ("", "?paper=1", "landscape?regime=every&paper=1", "model/prior", "matrix", "compare", "answers")
+        for view in (*(f"#/{each}" for each in views), "#/cases", "#/scenes", pair):
             page = visited.go(view)
             assert page.evaluate("document.documentElement.scrollWidth") <= width, view
             assert page.evaluate("document.querySelectorAll('h1').length") == 1
+
+
+def test_the_landscape_has_a_point_with_its_intervals_for_each_row_of_the_table(site: Site, browser: Browser) -> None:
+    board = site.workspace.tables.read(LEADERBOARD, {})
+    rows = board.loc[(board["dataset"] == "chaotic") & (board["regime"] == "standard")].set_index("model")
+    with visit(browser, site.address) as visited:
+        page = visited.go("#/landscape?dataset=chaotic&regime=standard")
+        points = page.locator(".plane .point")
+        assert points.count() == len(rows) == 3
+        for place in range(3):
+            point = points.nth(place)
+            row = rows.loc[str(point.get_attribute("aria-label"))]
+            at = [float(str(point.locator("circle").get_attribute(name))) for name in ("cx", "cy")]
+            assert at == pytest.approx([x_of(page, row["j"]), 14 + (1 - row["acc"]) * (520 - 14 - 44)], abs=0.01)
+            across = point.locator(".interval-bar").first
+            ends = [float(str(across.get_attribute(name))) for name in ("x1", "x2")]
+            low, high = max(-1, row["j_ci_low"]), min(1, row["j_ci_high"])
+            assert ends == pytest.approx([x_of(page, low), x_of(page, high)], abs=0.01)
+        points.first.locator("text").click()
+        page.wait_for_url(re.compile(r"#/model/"))
+
+
+def x_of(page: Page, j: float) -> float:
+    """Where a value of J stands on the plane, from the positions of 0 and 1."""
+    zero = float(str(page.locator(".plane .axis").get_attribute("x1")))
+    return zero + j * (620 - zero)
+
+
+def test_a_view_is_taken_along_as_a_table_or_as_an_address(site: Site, browser: Browser, tmp_path: Path) -> None:
+    board = site.workspace.tables.read(LEADERBOARD, {})
+    with visit(browser, site.address) as visited:
+        page = visited.go("#/?dataset=chaotic&regime=standard")
+        with page.expect_download() as download:
+            page.get_by_role("button", name="CSV").first.click()
+        download.value.save_as(tmp_path / "board.csv")
+        read = pd.read_csv(tmp_path / "board.csv").set_index("model")["pecs"].sort_index()
+        wanted = board.loc[(board["dataset"] == "chaotic") & (board["regime"] == "standard")].set_index("model")["pecs"]
+        pd.testing.assert_series_equal(read, wanted.sort_index())
+        page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+        page = visited.go("#/pair/occlusion/hidden_race-0001?model=prior&regime=standard&run=1")
+        page.get_by_role("button", name="Copy link").click()
+        page.get_by_role("button", name="Copied").wait_for()
+        address = page.evaluate("navigator.clipboard.readText()")
+        page.get_by_label("speed").select_option("0.25")
+        page.get_by_role("button", name="Play").click()
+        until(page, "[...document.querySelectorAll('video')].every(video => video.playbackRate === 0.25)")
+    with visit(browser, site.address) as visited:  # as a colleague opens it
+        visited.page.goto(address)
+        visited.page.wait_for_selector(".panel h3")
+        assert "hidden_race-0001" in visited.page.inner_text(".lead")
+        assert visited.page.locator(".panel h3").inner_text().startswith("prior, standard, run 1")
+
+
+def test_what_an_address_names_wrongly_is_said(site: Site, browser: Browser) -> None:
+    with visit(browser, site.address) as visited:
+        pair = "#/pair/occlusion/hidden_race-0001"
+        for view, said in {
+            f"{pair}?model=nobody": "This study did not ask nobody.",
+            "#/compare?left=nobody&right=nobody2": "This study did not ask nobody and nobody2.",
+            "#/pair/occlusion": "The address names no scenario",
+            "#/pair/occlusion/none": "This study does not hold it.",
+            "#/answers?model=nobody": "Widen the filters above",
+        }.items():
+            assert said in visited.go(view).inner_text("main"), view
+
+
+def test_scenes_play_and_cases_lead_to_both_answers(site: Site, browser: Browser) -> None:
+    with visit(browser, site.address) as visited:
+        page = visited.go("#/scenes?family=hidden_race")
+        until(page, "document.querySelectorAll('video').length >= 3")
+        until(page, "[...document.querySelectorAll('video')].every(video => video.readyState >= 1)")
+        page = visited.go("#/cases?kind=textual")
+        first = page.locator("table[data-name=cases] tbody tr").first
+        visual, textual = (first.locator("a").nth(k).get_attribute("href") or "" for k in range(2))
+        for view, decision in ((visual, "answered"), (textual, "abstained")):
+            page = visited.go(view)
+            assert page.locator(".side h4 .chip").last.inner_text() == decision
 
 
 def test_text_of_a_model_is_text_wherever_it_is_shown(browser: Browser, tmp_path: Path) -> None:

@@ -20,9 +20,10 @@ VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void'
 
 def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
     assert f"{ANSWERS} answers asked (0 from the ledger)\n{VOTES} votes asked (0 from the ledger)\n" in small_output
-    report = small.workspace / "reports" / "report.html"
-    assert f"report {report}" in small_output.splitlines()
-    assert report.stat().st_size > 1000
+    reports = small.workspace / "reports"
+    for kind, page in (("report", reports / "report.html"), ("explorer", reports / "index.html")):
+        assert f"{kind} {page}" in small_output.splitlines()
+        assert page.stat().st_size > 1000
 
 
 def test_the_oracle_scores_one_and_nothing_is_missing(small: Checkout) -> None:

@@ -2,65 +2,89 @@
 
 from __future__ import annotations
 
-import re
-import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.build.cells import CELL, HOSTILE, write_cell
 from tests.conftest import Checkout
-from tests.pages import patient
-from traps_pipeline.report.cell_pages import item_pages
-from traps_pipeline.storage.study import Study
+from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import patient, until
+from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 
 
-def problems(page: Page) -> list[str]:
-    """Where console errors and requests that leave the machine are collected from now on."""
-    found = list[str]()
-    page.on("console", lambda message: found.append(message.text))
-    page.on("pageerror", lambda error: found.append(str(error)))
-    page.on("request", lambda r: found.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
-    return found
-
-
-def test_the_report_opens_from_disk_at_both_widths_and_its_links_lead_to_items(demo: Checkout, tmp_path: Path) -> None:
-    reports = demo.workspace / "reports"
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        for width in (1280, 1920):
-            page = patient(browser.new_page(viewport={"width": width, "height": 1000}))
-            found = problems(page)
-            page.goto((reports / "report.html").as_uri())
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            assert page.evaluate("[...document.images].every(image => image.naturalWidth > 0)")
-            first = page.locator("section").first
-            assert first.locator("h2").inner_text() == "Overall"
-            assert first.locator("tbody tr").count() == 9 * 3
-            page.screenshot(path=tmp_path / f"{width}.png", full_page=True)
-            assert found == []
-        hrefs = page.evaluate("[...document.querySelectorAll('a')].map(a => a.getAttribute('href'))")
-        anchors = dict[str, set[str]]()
-        for target, anchor in {(h.partition("#")[0], h.partition("#")[2]) for h in hrefs}:
-            if target not in anchors:
-                text = (reports / (target or "report.html")).read_text()
-                anchors[target] = set(re.findall(r'id="([^"]+)"', text))
-            assert not anchor or anchor in anchors[target], (target, anchor)
-        assert len([target for target in anchors if target]) == 108 + 2  # a page a cell, the index, and the cases
-        page.locator('a[href="items/occlusion__random-50__standard__run1.html"]').first.click()  # a PECS on a dataset
-        assert "Voids: cannot be answered (16)" in page.inner_text("body")
-        assert found == []
-
-        hostile = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
-        write_cell(hostile)
-        (tmp_path / "hostile.html").write_text("".join(item_pages(hostile, CELL, None)))
-        page.goto((tmp_path / "hostile.html").as_uri())
-        assert page.locator("td .text").first.inner_text() == HOSTILE
-        assert page.locator("script, img").count() == 0
-        assert found == []
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        yield browser
         browser.close()
+
+
+def opened(browser: Browser, file: Path, width: int) -> tuple[Page, list[str]]:
+    """A page of that width, and where its console messages and requests that leave the machine are collected."""
+    page, problems = patient(browser.new_page(viewport={"width": width, "height": 1000})), list[str]()
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("request", lambda r: None if r.url.startswith(("file:", "data:")) else problems.append(r.url))
+    page.goto(file.as_uri())
+    return page, problems
+
+
+@pytest.mark.parametrize("width", [390, 1280, 1920])
+def test_the_report_opens_from_disk_at_each_width(demo: Checkout, browser: Browser, width: int) -> None:
+    page, problems = opened(browser, demo.workspace / "reports" / "report.html", width)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate("[...document.images].every(image => image.naturalWidth > 0)")
+    assert page.locator("#leaderboard tbody tr").count() == 9 * 3
+    assert "the 9 models abstain on 0 to 100 % of the voids" in page.inner_text("#findings")
+    assert page.locator("#appendix ~ details[open]").count() == 0
+    anchors = page.evaluate("[...document.querySelectorAll('a[href^=\"#\"]')].map(a => a.hash.slice(1))")
+    assert len(anchors) > 30 and page.evaluate("ids => ids.filter(id => !document.getElementById(id))", anchors) == []
+    assert "Spread over runs: no cell has more than one run." in page.inner_text("#not-run + section")
+    page.locator("a[href='#table-models']").click()  # opens what is collapsed
+    assert page.locator("#table-models tbody tr").first.is_visible()
+    assert problems == []
+
+
+def test_a_number_leads_to_its_answers_and_the_explorer_back_to_the_report(demo: Checkout, browser: Browser) -> None:
+    page, problems = opened(browser, demo.workspace / "reports" / "report.html", 1280)
+    row = page.locator("#leaderboard tbody tr", has_text="random-50").first
+    row.locator("a[href*='dataset=occlusion']").first.click()
+    page.wait_for_selector(".answer")
+    assert page.locator(".status").inner_text().startswith("32 of 3456 answers")  # 16 pairs
+    page.locator(".answer a").first.click()
+    until(page, "[...document.querySelectorAll('video')].some(video => video.readyState >= 2)")  # of the study's folder
+    page.get_by_role("link", name="Report").click()
+    page.wait_for_selector("#leaderboard")
+    assert problems == []
+
+
+def test_tables_and_figures_are_saved_with_a_click(demo: Checkout, browser: Browser, tmp_path: Path) -> None:
+    page, problems = opened(browser, demo.workspace / "reports" / "report.html", 1280)
+    saved = {}
+    for place, kind in (
+        ("#leaderboard", "CSV"),
+        ("#leaderboard", "LaTeX"),
+        ("#figure-abs_rec", "SVG"),
+        ("#figure-abs_rec", "PNG"),
+    ):
+        with page.expect_download() as download:
+            page.locator(place).get_by_text(kind, exact=True).first.click()
+        saved[kind] = tmp_path / download.value.suggested_filename
+        download.value.save_as(saved[kind])
+    assert [path.name for path in saved.values()] == [
+        "leaderboard_overall.csv", "leaderboard_overall.tex", "abs_rec.svg", "abs_rec.png",
+    ]  # fmt: skip
+    board = Workspace.open(demo.workspace).tables.read(LEADERBOARD, {})
+    expected = board.loc[board["dataset"] == "overall"].set_index(["model", "regime"])["acc"].sort_index()
+    read = pd.read_csv(saved["CSV"]).set_index(["model", "regime"])["acc"].sort_index()
+    pd.testing.assert_series_equal(read, expected)
+    assert r"\begin{table}" in saved["LaTeX"].read_text()
+    assert saved["SVG"].read_text().startswith("<?xml") and saved["PNG"].read_bytes().startswith(b"\x89PNG")
+    assert problems == []

@@ -49,7 +49,11 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             page.goto(server.address)
             assert page.locator("#progress").inner_text() == "0 of 12 reviewed"
             first = page.locator("h1").inner_text()
-            page.keyboard.press("k")  # without a reason nothing is decided: the field for it is there
+            page.keyboard.press("k")  # without a reason nothing is decided, and the next key is a key
+            assert "needs a reason: press w" in page.inner_text("#said")
+            page.keyboard.press("k")
+            assert page.input_value("#why") == ""
+            page.keyboard.press("w")
             page.keyboard.type("looks right")
             press(page, "Enter")
             for _ in range(4):

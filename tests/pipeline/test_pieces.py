@@ -1,4 +1,4 @@
-"""Of an asset of many tables or figures only those are made again whose inputs, code or files changed."""
+"""Of the parts of an asset only those are made again whose inputs or code changed, or whose content is damaged."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from traps_pipeline.pipeline import pieces
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
+
+READS = {"overall": ("leaderboard",), "sub_scenarios": ("metrics", "items")}
 
 
 @pytest.fixture
@@ -26,21 +28,19 @@ class Report:
 
     def __init__(self, root: Path) -> None:
         self.workspace = Workspace.create(root / "study", Study())
+        self.archive = self.workspace.reports / ".state" / "report_page.pieces.zip"
         self.made = Counter[str]()
 
-    def piece(self, name: str, *reads: str) -> Piece:
-        def make() -> dict[str, bytes]:
+    def piece(self, name: str) -> Piece:
+        def make() -> bytes:
             self.made[name] += 1
-            return {f"tables/{name}.md": f"{name}, made {self.made[name]} times".encode()}
+            return f"{name}, made {self.made[name]} times".encode()
 
-        return Piece(name, make, reads)
+        return Piece(name, make, READS[name])
 
     def make(self, *, code: str = "1", names: tuple[str, ...] = ("overall", "sub_scenarios")) -> list[str]:
-        reads = {"overall": ("leaderboard",), "sub_scenarios": ("metrics", "items")}
-        both = [self.piece(name, *reads[name]) for name in names]
-        files, remade = make_pieces(self.workspace, "report_tables", code, both)
-        assert [*files] == [f"tables/{name}.md" for name in names]
-        self.workspace.store.write({self.workspace.reports / path: data for path, data in files.items()})
+        contents, remade = make_pieces(self.workspace, "report_page", code, [self.piece(name) for name in names])
+        assert contents == {name: f"{name}, made {self.made[name]} times".encode() for name in names}
         return remade
 
 
@@ -52,44 +52,44 @@ def report(tmp_path: Path, versions: dict[str, str]) -> Report:
 
 
 def test_nothing_is_made_again_while_nothing_changed(report: Report) -> None:
+    before = report.archive.stat().st_mtime_ns
     assert report.make() == []
     assert report.made == {"overall": 1, "sub_scenarios": 1}
+    assert report.archive.stat().st_mtime_ns == before
 
 
 def test_a_table_is_made_again_when_a_partition_that_it_reads_changed(report: Report, versions: dict[str, str]) -> None:
     versions["metrics/chaotic"] = "2"
     assert report.make() == ["sub_scenarios"]
+    assert report.make() == []
 
 
 def test_a_changed_formula_makes_all_again(report: Report) -> None:
     assert report.make(code="2") == ["overall", "sub_scenarios"]
 
 
-@pytest.mark.parametrize("damage", ["gone", "edited"])
-def test_a_file_that_is_not_what_was_written_is_made_again(report: Report, damage: str) -> None:
-    path = report.workspace.reports / "tables" / "overall.md"
-    path.unlink() if damage == "gone" else path.write_text("99.9")
-    assert report.make() == ["overall"]
-
-
-def test_files_of_a_table_that_is_no_more_are_removed(report: Report) -> None:
-    assert report.make(names=("overall",)) == []
-    assert [path.name for path in (report.workspace.reports / "tables").iterdir()] == ["overall.md"]
-
-
-def test_a_note_that_cannot_be_read_makes_all_again(report: Report) -> None:
-    (report.workspace.reports / ".state" / "report_tables.pieces.json").write_text("{")
+@pytest.mark.parametrize("damage", ["gone", "no archive", "a flipped byte"])
+def test_a_damaged_archive_makes_all_again(report: Report, damage: str) -> None:
+    data = report.archive.read_bytes()
+    at = data.index(b"sub_scenarios", data.index(b"PK\x03\x04", 4)) + len("sub_scenarios")  # in a member's content
+    flipped = data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :]
+    report.archive.unlink() if damage == "gone" else report.archive.write_bytes(
+        b"{" if damage == "no archive" else flipped
+    )
     assert report.make() == ["overall", "sub_scenarios"]
+
+
+def test_a_table_that_is_no_more_leaves_the_archive(report: Report) -> None:
+    assert report.make(names=("overall",)) == []
+    assert report.make() == ["sub_scenarios"]
 
 
 def test_a_picture_is_made_again_when_the_rows_that_it_shows_change_and_not_with_their_table(
     report: Report, versions: dict[str, str]
 ) -> None:
     def made_again(rows: list[str]) -> list[str]:
-        picture = Piece("sheet", lambda: {"sheet.png": repr(rows).encode()}, inputs=rows)
-        files, remade = make_pieces(report.workspace, "contact_sheet", "1", [picture])
-        report.workspace.store.write({report.workspace.reports / path: data for path, data in files.items()})
-        return remade
+        picture = Piece("sheet", lambda: repr(rows).encode(), inputs=rows)
+        return make_pieces(report.workspace, "site", "1", [picture])[1]
 
     assert made_again(["plinko-0001"]) == ["sheet"]
     versions["metrics/chaotic"] = "2"

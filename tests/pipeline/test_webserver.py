@@ -181,7 +181,7 @@ def test_beyond_this_machine_a_token_of_ones_own_is_wanted(
 
 def test_the_report_and_clips_of_a_study_are_served_and_nothing_else_of_it(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path / "study", Study())
-    for name in ("reports/report.html", "reports/.state/gallery.json", "clips/a-1/void.mp4", "outside.txt"):
+    for name in ("reports/report.html", "reports/.state/site.json", "clips/a-1/void.mp4", "outside.txt"):
         (workspace.root / name).parent.mkdir(parents=True, exist_ok=True)
         (workspace.root / name).write_bytes(b"0123456789")
     (workspace.root / "reports" / "link.html").symlink_to(workspace.root / "study.yaml")
@@ -190,5 +190,5 @@ def test_the_report_and_clips_of_a_study_are_served_and_nothing_else_of_it(tmp_p
     part = client.get("/study/clips/a-1/void.mp4", headers={"Range": "bytes=2-4"})  # as a browser seeks in a clip
     assert (part.status_code, part.text) == (206, "234")
     outside = ("study.yaml", "outside.txt", "ledger/answers", "reports/../study.yaml", "reports/%2e%2e/study.yaml")
-    for path in (*outside, "reports/.state/gallery.json", "reports/link.html", "reports", "clips//etc/passwd"):
+    for path in (*outside, "reports/.state/site.json", "reports/link.html", "reports", "clips//etc/passwd"):
         assert client.get(f"/study/{path}").status_code == 404, path

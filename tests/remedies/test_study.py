@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from traps_pipeline.explorer.answers import study_items
 from traps_pipeline.models.answers import wanted_questions
 from traps_pipeline.pipeline.experiment import Experiment, load_experiment
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.stages import judging_stages, report_stages, scoring_stages
+from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
 from traps_pipeline.scenes.worlds.clips import read_clip
@@ -41,13 +40,9 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     (study.workspace / "tables").mkdir()
     workspace = Workspace.open(study.workspace)
     experiment = load_experiment(str(study.root / EXPERIMENT))
-    cards = {**{name: partial(make, workspace) for name, make in FILES.items()}}
     again: list[Callable[[], Any]] = [
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
         refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
-        refused(cards["sheet"], "pipeline.stages.report_stages"),
-        refused(cards["gallery"], "pipeline.stages.report_stages"),
-        refused(cards["shortcuts"], "pipeline.stages.report_stages"),
         refused(lambda: scoring_stages._make_metrics(workspace, "occlusion"), "pipeline.stages.scoring_stages"),
         refused(lambda: scoring_stages._scored(workspace, "contrasts"), "pipeline.stages.scoring_stages"),
         refused(lambda: scoring_stages._make_robust(workspace, None), "pipeline.stages.scoring_stages"),
@@ -89,9 +84,6 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     items.write_bytes(items.read_bytes()[:-200])
     made = may_be_made(workspace, "responses")
     return [*calls, refused(made, "", error=AssertionError)]
-
-
-FILES = {"sheet": report_stages._sheets, "gallery": report_stages._gallery, "shortcuts": report_stages._shortcuts}
 
 
 def may_be_made(workspace: Workspace, stage: str) -> Callable[[], None]:

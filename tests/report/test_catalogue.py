@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.image import imread
 
 from tests.build.boards import board_of, board_row
 from tests.build.cells import row
@@ -20,11 +19,19 @@ from traps_pipeline.judging.judging_rows import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish
-from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES, workspace_files
+from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
-from traps_pipeline.report.writing import Column, PrintedTable, figure_files, freeze_layout, table_files, table_latex
+from traps_pipeline.report.writing import (
+    Column,
+    NotRun,
+    PrintedTable,
+    figure_files,
+    freeze_layout,
+    table_files,
+    table_latex,
+)
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -119,7 +126,7 @@ def test_a_model_whose_every_call_failed_is_a_row_of_dashes_and_breaks_no_page(b
     assert (row["Ratio"], row["PECS, guided"], row["Missing"]) == ("– ‡", "– ‡", "5616")
     assert shown(uplift, model=THINKS)["Ratio"] == "1.00 †"
     assert BROKEN not in set(broken_tables["frontier"].rows["model"])
-    page = publish.report_files(broken, PAPER, [], {})["report.html"].decode()
+    page = publish.report_files(broken, [])["report.html"].decode()
     assert '– <span class="mark">‡</span>' in page
     assert not re.search(r"\bnan\b", page)
     for table in broken_tables.values():
@@ -262,7 +269,11 @@ def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, emp
     from matplotlib.text import Text
 
     for results in (PAPER, partial, empty):
-        figure = report.make(results)
+        try:
+            figure = report.make(results)
+        except NotRun as why:
+            assert str(why)
+            continue
         assert overhang(figure) < 0.01
         assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= 6
 
@@ -288,13 +299,10 @@ def test_the_doubt_figure_refuses_to_mix_epochs():
     assert set(flash["doubt"]) == {0.20}
 
 
-def test_the_report_is_few_assets_that_depend_on_all_that_their_tables_and_figures_read():
+def test_the_report_page_depends_on_all_that_its_tables_and_figures_read():
     graph = the_graph()
-    for name, reports in (("report_tables", TABLES), ("report_figures", FIGURES)):
-        reads = {stage for report in reports for stage in report.reads}
-        assert graph.parents(name, None).keys() == reads & graph.declared.keys()
-    assert graph.parents("published_report", None) == {"published": [None]}
-    assert {"report_tables", "report_figures", "published_report", "verdicts"} <= graph.parents_of["report_page"].keys()
+    reads = {stage for report in (*TABLES, *FIGURES) for stage in report.reads}
+    assert (reads & graph.declared.keys()) | {"published", "verdicts"} <= graph.parents("report_page", None).keys()
 
 
 def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
@@ -320,14 +328,6 @@ def test_names_of_tables_and_figures_are_unique():
     assert len({report.name for report in FIGURES}) == len(FIGURES)
 
 
-def test_a_workspace_keeps_every_table_file_and_a_figures_picture(partial):
-    files = workspace_files(next(r for r in TABLES if r.name == "overall"), partial)
-    assert sorted(files) == [f"tables/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")]
-    files = workspace_files(next(r for r in FIGURES if r.name == "doubt_conversion"), PAPER)
-    assert list(files) == ["figures/published/doubt_conversion.png"]
-    assert imread(io.BytesIO(files["figures/published/doubt_conversion.png"])).shape[1] == 990  # 3.3 in, 300 dpi
-
-
 def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch, capsys):
     chosen = [next(r for r in FIGURES if r.name == "doubt_conversion")]
     monkeypatch.setattr(publish, "FIGURES", chosen)
@@ -335,10 +335,10 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     assert main(["results", "export", str(tmp_path), "--workspace", str(workspace.root)]) == 0
     files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
     assert {f"tables/published/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")} <= files
-    assert {
-        f"figures/{p}doubt_conversion.{kind}" for p in ("", "published/") for kind in ("pdf", "svg", "png")
-    } <= files
-    assert f"{len(files - {'items/made.json'})} files in {tmp_path}" in capsys.readouterr().out
+    assert {file for file in files if "doubt" in file} == {
+        f"figures/published/doubt_conversion.{kind}" for kind in ("pdf", "svg", "png")
+    }
+    assert f"{len(files)} files in {tmp_path}" in capsys.readouterr().out
     index = (tmp_path / "index.html").read_text()
     linked = set(re.findall(r'href="([^"]+)"', index))
     assert {path for path in files if path.split("/")[0] in ("tables", "figures")} <= linked

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from itertools import pairwise, product
+from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, cast
 
@@ -28,8 +28,9 @@ from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
+from traps_pipeline.report.cards import Sources, figure_card
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
-from traps_pipeline.report.page import Card, picture_block, report_html
+from traps_pipeline.report.page import report_html
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.result_frames import Makers, Results
 from traps_pipeline.report.study_results import StudyResults
@@ -39,8 +40,9 @@ from traps_pipeline.report.tables.steering_tables import steering as steering_ta
 from traps_pipeline.report.tables.steering_tables import why
 from traps_pipeline.report.writing import PrintedTable
 from traps_pipeline.scoring.score_rows import LEADERBOARD
-from traps_pipeline.storage.study import Layers, MechanismSettings
+from traps_pipeline.storage.study import Layers, MechanismSettings, Study
 from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
 
 ABOUT = {"model": "m", "prompt": "standard", "epoch": "e"}
 
@@ -275,24 +277,20 @@ def test_a_lead_figure_says_what_it_shows_of_the_study_and_nothing_of_an_empty_o
     assert report.note(Results()) == report.doc
 
 
-def test_the_page_of_a_study_that_looked_inside_leads_with_its_claim_and_what_can_refute_it(
-    monkeypatch: pytest.MonkeyPatch,
+def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_its_controls_in_order(
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(publish, "TABLES", ())
-    study, paper, pixel = Results(), Results(), b"\x89PNG" + bytes(20)
-    study.is_study, paper.is_study = True, False
-    pictures = {report.path(results): pixel for report in FIGURES for results in (study, paper)}
+    """What can refute a claim about probes comes first, then gates, patches and doses; else figures stand as ever."""
 
-    def shown() -> list[str]:
-        chapters = publish._chapters(study, paper, str, pictures)
-        page = report_html(frame(LEADERBOARD).astype(object), chapters=chapters)
-        return re.findall(r'<section[^>]* id="figure-(\w+)"', page)
+    def shown(mechanism: MechanismSettings | None) -> list[str]:
+        workspace = Workspace.create(tmp_path / f"{mechanism is None}", Study(mechanism=mechanism))
+        return [part.name for part in publish.report_parts(Sources(workspace)) if part.chapter == "figures"]
 
     order = [report.name for report in FIGURES]
-    assert shown() == order and order[: len(INSIDE)] != [*INSIDE]
-    study.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
-    assert shown()[:3] == ["states_and_output", "lens", "probe_baselines"] == [*INSIDE[:3]]
-    assert shown() == [*INSIDE, *(name for name in order if name not in INSIDE)]
+    assert shown(None) == order and order[: len(INSIDE)] != [*INSIDE]
+    inside = shown(MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}))
+    assert inside[:3] == ["states_and_output", "lens", "probe_baselines"] == [*INSIDE[:3]]
+    assert inside == [*INSIDE, *(name for name in order if name not in INSIDE)]
 
 
 def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no_answer() -> None:
@@ -347,7 +345,7 @@ def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> No
 def test_that_figures_are_not_comparable_is_said_beside_the_legend(name: str) -> None:
     made = Made()
     made.judged_by = "Judged by rules, not comparable: pocket."
-    figure = next(report for report in FIGURES if report.name == name)._figure(made)
+    figure = next(report for report in FIGURES if report.name == name).figure(made)
     figure.draw_without_rendering()
     (said,) = [text for text in figure.texts if "not comparable" in text.get_text()]
     others = [figure.legends[0].get_window_extent(), *(axes.get_tightbbox() for axes in figure.axes)]
@@ -362,11 +360,16 @@ def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
     assert (0.9, 0.5) not in points
 
 
-def test_the_page_says_below_a_figures_title_what_it_shows() -> None:
+def test_the_page_says_below_a_figures_title_what_it_shows(tmp_path: Path) -> None:
     report = next(report for report in FIGURES if report.name == "patching")
-    card = Card("figure-patching", report.title, [picture_block("made up", b"\x89PNG" + bytes(20))], report.doc)
-    page = report_html(frame(LEADERBOARD).astype(object), chapters=[("Figures", [card])])
-    assert f'<p class="shows">{report.doc}</p>' in page and "1 is the whole difference of the outcome" in report.doc
+    sources = Sources(Workspace.create(tmp_path / "study", Study()))
+    assert figure_card(report, sources).why == "the experiment asks for no `patching`"
+    sources.study = Made()
+    page = report_html(frame(LEADERBOARD).astype(object), [figure_card(report, sources)])
+    assert (
+        f'<p class="shows">{report.note(Made())}</p>' in page
+        and "1 is the whole difference of the outcome" in report.doc
+    )
 
 
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
@@ -411,10 +414,9 @@ def test_the_deviation_of_noise_is_not_said_to_be_over_runs() -> None:
         assert any("log-odds that the first answer token" in note for note in table.notes)
 
 
-def test_the_page_of_a_study_that_looks_inside_explains_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publish, "_chapters", lambda *_: [])
+def test_the_page_of_a_study_that_looks_inside_explains_its_words() -> None:
     results = PublishedResults()
     for mechanism, there in ((None, False), (MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}), True)):
         results.mechanism = mechanism
-        page = publish.report_files(results, results, [], {})[publish.PAGE].decode()
+        page = publish.report_files(results, [])[publish.PAGE].decode()
         assert ("distance between the mean states of voids and of controls" in page) == there

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import io
 import re
 
@@ -15,12 +17,13 @@ from tests.build.errors import raises
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
+from traps_pipeline.report.cards import EXPLORER, Card, data_address, explorer_address
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs, telling_times
 from traps_pipeline.report.figures.label_placement import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
-from traps_pipeline.report.worked_example import chosen_example, example_figure, reading
+from traps_pipeline.report.worked_example import Example, chosen_example, example_figure, reading
 from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
@@ -126,10 +129,10 @@ def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
         assert "incomplete: fewer than 99 % of items answered" in table
     page = report_html(board)
     assert page.count('<span class="mark">‡</span>') == 5  # PECS and n of the dataset's own table too
-    own = page.split("<h2>Chaotic</h2>")[1].split("</section>")[0]
+    own = page.split('id="leaderboard_chaotic"')[1].split("</details>")[0]
     assert own.count("‡") == 3  # and what it means
-    assert "‡" not in page.split("<h2>Occlusion</h2>")[1].split("</section>")[0]
-    assert "[0.249, 0.251]" in page.split("<h2>Occlusion</h2>")[1].split("</section>")[0]
+    assert "‡" not in page.split('id="leaderboard_occlusion"')[1].split("</details>")[0]
+    assert "[0.249, 0.251]" in page.split('id="leaderboard_occlusion"')[1].split("</details>")[0]
 
 
 def test_marks_and_columns_are_away_where_nothing_calls_for_them():
@@ -173,7 +176,7 @@ def test_a_hostile_model_id_stays_escaped_beside_marks_and_optional_columns():
     board = board_of(*cells_with_gaps(HOSTILE))
     rows = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in rows} == {18}
-    assert "<script" not in leaderboard_markdown(board) + report_html(board)
+    assert "<script" not in leaderboard_markdown(board) and report_html(board).count("<script") == 1  # the page's own
     assert "\x1b" not in leaderboard_text(board)
 
 
@@ -203,7 +206,7 @@ def test_null_figures_are_dashes_and_negative_ones_have_a_true_minus():
 
 def test_html_escapes_a_hostile_model_id(board):
     page = report_html(board)
-    assert "<script" not in page
+    assert page.count("<script") == 1  # the page's own
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
 
@@ -219,19 +222,29 @@ def test_text_lets_no_model_id_steer_the_terminal(board):
     assert "\x1b" not in leaderboard_text(board)
 
 
-def test_html_asks_the_network_for_nothing(board, png):
-    page = report_html(board, {"PECS landscape": png})
-    targets = re.findall(r"""(?:src|href|action|data|poster|srcset)\s*=\s*["']?([^"'\s>]*)""", page)
-    assert len(targets) == 1
-    assert targets[0].startswith("data:image/png;base64,")
-    assert not re.search(r"url\(|@import|<link|<script|<iframe", page)
-    assert "default-src 'none'" in page
+def test_html_asks_the_network_for_nothing(board):
+    svg = figure_bytes(landscape_figure(points(board), "Overall"), "svg")
+    card = Card("figure-x", "A figure", f'<img src="{data_address("svg", svg)}">')
+    page = report_html(board, [card], address=explorer_address, explorer=EXPLORER)
+    script = page.partition("<script>")[2].partition("</script>")[0]
+    targets = {
+        *re.findall(r"""\s(?:src|href|action|data|poster|srcset)\s*=\s*["']([^"']*)""", page.replace(script, ""))
+    }
+    kinds = {target.partition(",")[0].partition("?")[0] for target in targets if not target.startswith("#")}
+    assert kinds == {
+        "index.html", "index.html#/answers",
+        *(f"data:{kind};base64" for kind in ("image/svg+xml", "text/csv", "application/x-tex")),
+    }  # fmt: skip
+    assert not re.search(r"url\(|@import|<link|<iframe", page) and page.count("<script") == 1
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'" in page
 
 
 def test_html_shows_every_dataset_version_epoch_n_and_the_legend(board):
     page = report_html(board)
-    for title in ("Overall", "Occlusion", "Occlusion, ill-posed", "Chaotic", "Chaotic, ill-posed"):
-        assert f"<h2>{title}</h2>" in page
+    assert "<h2>Leaderboard</h2>" in page
+    for title in ("occlusion", "occlusion, ill-posed", "chaotic", "chaotic, ill-posed"):
+        assert f"<summary>Leaderboard, {title}</summary>" in page
     for term in ("Acc", "AbsRec", "FalseAbs", "J", "PECS", "n", "Missing", "Epoch"):
         assert f"<dt>{term}</dt>" in page
     assert page.count("Benchmark version v1; epoch e1.") == 6  # the page, overall, and each dataset
@@ -257,7 +270,7 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
 
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
     board = pd.DataFrame(columns=pd.Index(LEADERBOARD.names))
-    assert "Overall" in report_html(board)
+    assert "not run: this study has no leaderboard yet" in report_html(board)
     assert "not run: this study has no leaderboard yet" in leaderboard_text(board)
     assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")
 
@@ -388,7 +401,7 @@ def test_the_worked_example_is_a_pair_with_both_answers_and_their_verdicts(tmp_p
     ]  # fmt: skip
     assert reading("Left.", votes[:3], rows[3])[2] == "Verdict: answered, though the outcome cannot be known."
     pair = pd.DataFrame(pair_rows("plinko-0", tmp_path, kept=5)).set_index("side")
-    figure = example_figure(pair, {"control": words, "void": words}, tmp_path, "a model")
+    figure = example_figure(Example(pair, "a model", {"control": words, "void": words}), tmp_path)
     assert figure_bytes(figure).startswith(b"\x89PNG")
 
 
@@ -399,10 +412,11 @@ def test_the_sheet_of_arms_takes_the_scenario_with_most_arms_and_draws_a_row_a_c
     swapped = {"arm": "twin_control", "side": "control", "question": "Where is it?", "ground_truth": "left"}
     filmed = [("plinko-0", held), ("plinko-1", held), ("plinko-1", swapped)]
     arms = pd.DataFrame([{"scenario_id": s, "clip": f"{s}-void.mp4", **arm} for s, arm in filmed])
-    (png,) = arms_sheets(items, arms, tmp_path).values()
+    (whole,) = arms_sheets(items, arms, tmp_path).values()
     (smaller,) = arms_sheets(items, arms.iloc[:2], tmp_path).values()
     tall, less_tall = (
-        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape[0] for data in (png, smaller)
+        cv2.imdecode(np.frombuffer(figure_bytes(sheet), np.uint8), cv2.IMREAD_COLOR).shape[0]
+        for sheet in (whole, smaller)
     )
     row = round(150 * (FRAME_IN * 48 / 64 + GAP_IN))  # at 150 dots an inch; the clips are 64 wide and 48 high
     assert tall - less_tall == pytest.approx(row, abs=1)  # control, void and two arms against control, void and one

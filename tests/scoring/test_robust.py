@@ -134,6 +134,17 @@ def test_a_kind_of_few_scenarios_weighs_less(rows: Rows) -> None:
     assert row.robust == pytest.approx(35 / 38 * (33 / 35 - 3 / 38))
 
 
+def test_a_run_whose_j_is_negative_counts_as_nothing(rows: Rows) -> None:
+    # Run 1: J = 1 - 1/2, Acc 1/2, as above: 1/4. Run 2: controls abstained on, voids answered: J < 0, so 0, not less.
+    wrong = (False, True, False)
+    runs = [
+        study(rows, [RIGHT] * 30, {"decoy": [SHY] * 30}, run=1),
+        study(rows, [wrong] * 30, {"decoy": [SHY] * 30}, run=2),
+    ]
+    row = only(robust(pd.concat(runs, ignore_index=True), 20))
+    assert row.robust == pytest.approx(1 / 8)
+
+
 def test_what_must_be_inferred_enters_neither_figure(rows: Rows) -> None:
     arms = {"decoy": [RIGHT] * 30, "late_panel": [SHY, SHY, RIGHT], "predictable_cut": [(False, False, None)]}
     row = only(robust(study(rows, [RIGHT] * 30, arms), 20))

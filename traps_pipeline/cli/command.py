@@ -99,16 +99,16 @@ class Parser(argparse.ArgumentParser):
 
 
 class Commands:
-    """The commands of a parser, some of them in groups."""
+    """The commands of a parser, some of them in groups. by_name: their parsers."""
 
     def __init__(self, parser: Parser, groups: Mapping[str, str] | None = None) -> None:
         title = "groups" if groups else "commands"
         self._parsers = {"": parser.add_subparsers(title=title, required=not groups, metavar=METAVAR)}
-        self._commands = parser.commands
+        self.by_name = parser.commands
         for name, text in (groups or {}).items():
             group = self._parsers[""].add_parser(name, help=text, description=text)
             group.set_defaults(command=_show_help, parser=group)
-            group.commands = self._commands
+            group.commands = self.by_name
             self._parsers[name] = group.add_subparsers(title="commands", metavar=METAVAR)
 
     def add(
@@ -136,7 +136,7 @@ class Commands:
         parser = self._parsers[group].add_parser(
             name, help=text, description=text, epilog=shown + codes, formatter_class=_Help
         )
-        self._commands[path] = parser
+        self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
         if workspace:
             parser.add_argument(

@@ -28,14 +28,13 @@ def add(commands: Commands) -> None:
     text = "print a script that lets a shell complete commands, options and experiments"
     parser = commands.add("completion", completion, text, example="bash", workspace=False)
     parser.add_argument("shell", choices=tuple(USE))
+    parser.set_defaults(known=commands.by_name)
 
 
 def completion(arguments: argparse.Namespace) -> int:
     """See `traps completion --help`."""
-    from traps_pipeline.cli import build_parser
-
     commands, experiments = (
-        build_parser().commands,
+        arguments.known,
         sorted(path.stem for path in (ASSETS / "experiments").glob("*.yaml")),
     )
     groups = dict.fromkeys(path.split()[0] for path in commands if " " in path)

@@ -134,8 +134,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK
     _print_results(workspace)
-    print(f"report {workspace.reports / 'report.html'}")
-    print("next: open the report; traps why ITEM examines an item's answers; traps site writes the explorer")
+    print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
+    print("next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send on")
     return OK
 
 

@@ -23,7 +23,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.terminal import finalized
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.explorer.answers import StudyAnswers, study_answers
-from traps_pipeline.explorer.scenario_words import certificate_phrases, intervention
+from traps_pipeline.explorer.scenario_words import certificate_phrases, closes_frame, intervention
 from traps_pipeline.explorer.scripts import data_script, parquet_text
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
@@ -34,6 +34,7 @@ from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.scoring.analyses import REASONING_PAIRS
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
@@ -42,11 +43,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 WEB = Path(__file__).parent / "web"
-INDEX, SCRIPT, MANIFEST, DATA, CLIPS = "index.html", "explorer.js", "site.json", "data", "clips"
+INDEX, REPORT, SCRIPT, MANIFEST = "index.html", "report.html", "explorer.js", "site.json"
+DATA, CLIPS = "data", "clips"
 LIBRARY = WEB / "vendor" / "parquet.js"
 _SOURCES = (
-    *("dom.js", "numbers.js", "store.js", "outcomes.js", "parts.js"),
-    *("leaderboard.js", "model.js", "matrix.js", "answers.js", "player.js", "pair.js", "compare.js", "main.js"),
+    *("dom.js", "keys.js", "search.js", "download.js", "numbers.js", "store.js", "outcomes.js", "parts.js"),
+    *("leaderboard.js", "landscape.js", "model.js", "matrix.js", "answers.js", "player.js", "pair.js", "compare.js"),
+    *("cases.js", "scenes.js", "main.js"),
 )
 _ITEM_COLUMNS = (
     *("dataset", "scenario_id", "pair_id", "side", "category", "family", "sub_scenario", "question", "ground_truth"),
@@ -68,36 +71,50 @@ class Written:
     lacking: list[str] = field(default_factory=list)
 
 
+def site_files(workspace: Workspace) -> dict[str, bytes]:
+    """Return the explorer's files by path, for a folder beside the study's clips. Raises TrapsError without items."""
+    answers, scenarios = study_answers(workspace), _scenarios(workspace)
+    return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
+
+
 def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Written:
-    """Write the explorer of a study to a folder and return what it holds.
+    """Write the explorer and the report of a study to a folder that can be sent on, and return what it holds.
 
     Files of an earlier site in the folder are replaced, or removed where they are no longer needed; `index.html` is
     written last. clips: whether clips are put there, as hard links where the file system allows it, else as copies.
     Raises TrapsError where the folder holds something else, or the study has no items.
     """
     former = _former_files(folder)
-    answers = study_answers(workspace)
-    shown = _scenarios(workspace)
-    names = _clip_names(answers.items, shown) if clips else []
-    there = {name for name in names if workspace.resolve(name).is_file()}
-    written = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - there))
-    contents = _contents(workspace, answers, shown, there)
-    stamp = _digest(contents)
-    files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
-    files[SCRIPT] = script().encode()
-    files[INDEX] = index_page(workspace, stamp).encode()
-    for name in sorted(there):
+    answers, scenarios = study_answers(workspace), _scenarios(workspace)
+    names = _clip_names(answers.items, scenarios) if clips else []
+    existing = {name for name in names if workspace.resolve(name).is_file()}
+    written = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
+    page = workspace.reports / REPORT
+    report = {REPORT: workspace.store.here(page).read_bytes()} if workspace.store.has(page) else {}
+    files = report | _files(workspace, answers, scenarios, existing, "", report=bool(report))
+    for name in sorted(existing):
         written.clip_bytes += _put_clip(workspace.resolve(name), folder / name)
         written.clips += 1
-    manifest = json.dumps(sorted([*files, *there]), indent=0).encode()
-    write_bytes(folder / MANIFEST, json.dumps(sorted({*files, *there, *former}), indent=0).encode())
+    manifest = json.dumps(sorted([*files, *existing]), indent=0).encode()
+    write_bytes(folder / MANIFEST, json.dumps(sorted({*files, *existing, *former}), indent=0).encode())
     for name, content in files.items():  # the index comes last
         write_bytes(folder / name, content)
         written.files, written.bytes = written.files + 1, written.bytes + len(content)
-    for name in sorted(former - {*files, *there}):
+    for name in sorted(former - {*files, *existing}):
         (folder / name).unlink(missing_ok=True)
     write_bytes(folder / MANIFEST, manifest)
     return written
+
+
+def _files(
+    workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str], clips_at: str, *,
+    report: bool,
+) -> dict[str, bytes]:  # fmt: skip
+    """The files by path, the index last. clips: those that can be played; clips_at: the folder that holds `clips`."""
+    contents = _contents(workspace, answers, scenarios, clips)
+    stamp = _digest(contents)
+    files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
+    return {**files, SCRIPT: script().encode(), INDEX: index_page(workspace, stamp, clips_at, report=report).encode()}
 
 
 def _former_files(folder: Path) -> set[str]:
@@ -192,6 +209,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "published": _records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,
+        "reasoning_pairs": [*map(list, REASONING_PAIRS)],
     }
 
 
@@ -223,9 +241,15 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "twin_answer": twin["ground_truth"],
                 "twin_clip": of_twin["path"] if of_twin else None,
                 "fps": of_control["fps"] if of_control else None,
+                "shown_at": _seconds(closes_frame(spec), of_control),
             }
         )
     return rows
+
+
+def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None:
+    """The last moment at which a control shows its outcome; null where that is its end."""
+    return None if closes is None or clip is None else (closes - 0.5) / clip["fps"]
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -261,7 +285,7 @@ def script() -> str:
     return f'{library.decode("utf-8")}\n(() => {{\n"use strict";\n{sources}\n}})();\n'
 
 
-def index_page(workspace: Workspace, stamp: str) -> str:
+def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: bool = False) -> str:
     """The page that opens the explorer. It may load scripts and clips of its own folder, and nothing else."""
     import jinja2
 
@@ -273,5 +297,5 @@ def index_page(workspace: Workspace, stamp: str) -> str:
     template = environment.from_string((WEB / "index.html.j2").read_text(encoding="utf-8"))
     return template.render(
         title=f"{load_release().name}: {workspace.study.name}", version=stamp, style=style, style_digest=digest,
-        script=SCRIPT, data=DATA,
+        script=SCRIPT, data=DATA, clips_at=clips_at, report=REPORT if report else "",
     )  # fmt: skip

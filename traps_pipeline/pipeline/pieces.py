@@ -1,91 +1,83 @@
-"""Assets that hold many files, of which only those are made again whose inputs changed.
+"""Parts of an asset that are made again only when what they are made from changed.
 
-The report's tables and figures are one asset each, as a reader of the graph would draw them. A piece is one table,
-figure or picture. Beside the asset's own state lies a note of what each piece was made from, and of the digests of its
-files.
+The report is one page of a hundred tables, figures and pictures. Each is a piece: its content lies in an archive beside
+the asset's state, together with a digest of its inputs.
 """
 
 from __future__ import annotations
 
-import hashlib
+import io
 import json
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 
-Files = dict[str, bytes]  # content by path below the workspace's reports
+NOTES = "inputs.json"  # of the archive: the digest of each piece's inputs
+_DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same pieces are the same bytes
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One table or figure. make: its files.
+    """One part of an asset.
 
-    reads: the stages and sources that it is made from; it is made again when a version of one changes. inputs: where a
-    table is not looked at whole, the part that is, as JSON, which is compared instead.
+    Parameters
+    ----------
+    make
+        Returns the content.
+    reads
+        The stages and sources that it is made from; it is made again when a version of one changes.
+    inputs
+        Where not whole tables matter, the part that does, as JSON; it is compared instead of versions.
     """
 
     name: str
-    make: Callable[[], Files]
+    make: Callable[[], bytes]
     reads: Sequence[str] = ()
     inputs: Any = None
 
 
-@dataclass(frozen=True)
-class _Note:
-    """What a piece was made from, as a digest, and the SHA-256 of each of its files."""
+def make_pieces(
+    workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]
+) -> tuple[dict[str, bytes], list[str]]:
+    """Return the content of all pieces by name, and the names of those that were made again.
 
-    inputs: str
-    files: Mapping[str, str]
-
-
-def make_pieces(workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]) -> tuple[Files, list[str]]:
-    """Return the files of all pieces, and the names of those that were made again.
-
-    A piece is taken as it lies there if its inputs and the stage's code are those that it was made from, and its files
-    are what was written. Files of pieces that are no more are removed.
+    A piece is taken from the archive if its inputs and the stage's code are those that it was made from.
     """
-    path = workspace.reports / ".state" / f"{stage}.pieces.json"
-    notes, now, files, remade = _read(workspace, path), dict[str, _Note](), Files(), list[str]()
+    path = workspace.reports / ".state" / f"{stage}.pieces.zip"
+    former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions = Lineage(workspace).inputs(stage, None)
+    inputs, contents, remade = dict[str, str](), dict[str, bytes](), list[str]()
     for piece in pieces:
-        mine = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
-        inputs, note = digest([code, mine if piece.inputs is None else piece.inputs]), notes.get(piece.name)
-        content = _unchanged(workspace, note) if note is not None and note.inputs == inputs else None
-        if content is None:
+        own = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
+        inputs[piece.name] = digest([code, own if piece.inputs is None else piece.inputs])
+        known, content = former.get(piece.name, ("", b""))
+        if known != inputs[piece.name]:
             content = piece.make()
             remade.append(piece.name)
-        files |= content
-        now[piece.name] = _Note(inputs, {name: hashlib.sha256(data).hexdigest() for name, data in content.items()})
-    former = {name for note in notes.values() for name in note.files}
-    workspace.store.remove(workspace.reports / name for name in sorted(former - files.keys()))
-    text = json.dumps({name: [note.inputs, note.files] for name, note in now.items()})
-    workspace.store.write({path: text.encode()})
-    return files, remade
+        contents[piece.name] = content
+    if remade or former.keys() != contents.keys():
+        workspace.store.write({path: _archive(inputs, contents)})
+    return contents, remade
 
 
-def _read(workspace: Workspace, path: Path) -> dict[str, _Note]:
-    """Return the notes of an asset; none where there are none, or they cannot be read: all pieces are made again."""
-    if not workspace.store.has(path):
-        return {}
+def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {NOTES: json.dumps(inputs).encode(), **contents}.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), content, zipfile.ZIP_DEFLATED)
+    return stream.getvalue()
+
+
+def _read(data: bytes) -> dict[str, tuple[str, bytes]]:
+    """Return the digest of the inputs and the content of each piece; none if the archive is damaged."""
     try:
-        return {name: _Note(*note) for name, note in json.loads(workspace.store.here(path).read_bytes()).items()}
-    except (ValueError, TypeError, AttributeError):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            inputs = json.loads(archive.read(NOTES))
+            return {name: (str(inputs[name]), archive.read(name)) for name in inputs}  # checks each CRC
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError):
         return {}
-
-
-def _unchanged(workspace: Workspace, note: _Note) -> Files | None:
-    """Return the files of a piece as they lie there; None if one of them is gone or altered."""
-    files = Files()
-    for name, expected in note.files.items():
-        path = workspace.reports / name
-        if not workspace.store.has(path):
-            return None
-        files[name] = workspace.store.here(path).read_bytes()
-        if hashlib.sha256(files[name]).hexdigest() != expected:
-            return None
-    return files

@@ -29,11 +29,13 @@ class Records:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A file of the study that a browser opens. path: below the workspace's root, so that it is right in a copy."""
+    """A file of the study that a browser opens. path: below the workspace's root, so that it is right in a copy; view:
+    the part of its address after #."""
 
     path: str
+    view: str = ""
 
     @property
     def url(self) -> str:
         """Its address on the server of `traps ui`."""
-        return f"{STUDY_URL}/{quote(self.path)}"
+        return f"{STUDY_URL}/{quote(self.path)}" + (f"#{self.view}" if self.view else "")

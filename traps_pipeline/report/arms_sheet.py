@@ -14,11 +14,12 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import ARMS, PANEL_DOSES, PANEL_LOOKS
 from traps_pipeline.report.contact_sheet import SampledClip, sampled, telling_times
-from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
+from traps_pipeline.report.writing import figure_style, new_figure
 from traps_pipeline.video.encode import decode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MOMENTS = 6  # frames a row
 FRAME_IN, WORDS_IN, GAP_IN, HEAD_IN = 1.5, 2.9, 0.06, 0.8
@@ -36,15 +37,15 @@ class Row:
     clip: SampledClip
 
 
-def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, bytes]:
-    """`arms_<taxonomy>.png` of the scenario of each taxonomy that admits most arms (of several, the first by id), and
-    `panels_occlusion.png` of that which admits most looks of the panel.
+def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, Figure]:
+    """`arms_<taxonomy>` of the scenario of each taxonomy that admits most arms (of several, the first by id), and
+    `panels_occlusion` of that which admits most looks of the panel.
 
-    items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No file where nothing was filmed. Raises
+    items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No figure where nothing was filmed. Raises
     DamagedClip when a clip cannot be decoded.
     """
     pairs = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
-    files: dict[str, bytes] = {}
+    figures: dict[str, Figure] = {}
     for (name, shown), (taxonomy, sides) in product(_SHEETS.items(), pairs.groupby("taxonomy", sort=True)):
         filmed = arms.loc[arms["clip"].notna() & arms["arm"].isin(shown)]
         own = filmed.loc[filmed["scenario_id"].isin(sides["scenario_id"])]
@@ -54,8 +55,8 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
             control = sides.loc[(sides["scenario_id"] == scenario) & (sides["side"] == "control"), "clip"]
             times = _moments(root / str(control.iloc[0]))
             rows = list(_rows(sides, own, scenario, root, times))
-            files[f"{name}_{taxonomy}.png"] = _sheet(scenario, rows, times)
-    return files
+            figures[f"{name}_{taxonomy}"] = _sheet(scenario, rows, times)
+    return figures
 
 
 def _moments(clip: Path) -> np.ndarray:
@@ -76,8 +77,8 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
         yield Row(name, right, str(row["question"]), sampled(frames, at, times))
 
 
-def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> bytes:
-    """PNG: a row a clip, its words on the left, frames at the control's times, hatched behind its end."""
+def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
+    """A row a clip, its words on the left, frames at the control's times, hatched behind its end."""
     _, tall, wide, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * tall / wide + GAP_IN
     width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in
@@ -102,7 +103,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> bytes:
                 bottom = height - HEAD_IN - (k + 1) * row_in + GAP_IN
                 box = (left / width, bottom / height, FRAME_IN / width, (row_in - GAP_IN) / height)
                 _draw_frame(figure.add_axes(box), row.clip, m)
-    return figure_bytes(figure)
+    return figure
 
 
 def _own_words(row: Row, control: Row) -> list[str]:

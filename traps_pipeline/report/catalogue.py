@@ -32,7 +32,7 @@ from traps_pipeline.report.tables import patching_tables as tables_of_patching
 from traps_pipeline.report.tables import probe_tables as tables_of_probes
 from traps_pipeline.report.tables import steering_tables as tables_of_mechanism
 from traps_pipeline.report.tables.table_columns import printed
-from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
+from traps_pipeline.report.writing import SOFT, NotRun, PrintedTable, figure_files, figure_style, table_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -133,21 +133,17 @@ class FigureReport:
         """Return what it says of a study, in one sentence a model where it has one, and what it shows."""
         return f"{self.finding(results)} {self.doc}".strip()
 
-    def path(self, results: Results) -> str:
-        """Path of its PNG."""
-        return f"{folder('figures', results)}/{self.name}.png"
-
-    def picture(self, results: Results) -> dict[str, bytes]:
-        """The PNG alone, by path, for the page and for Dagster."""
-        return {self.path(results): figure_bytes(self._figure(results))}
-
     def files(self, results: Results) -> dict[str, bytes]:
-        """PDF, SVG and PNG by path."""
-        files = figure_files(self.name, self._figure(results))
+        """PDF, SVG and PNG by path; none if the figure was not run."""
+        try:
+            files = figure_files(self.name, self.figure(results))
+        except NotRun:
+            return {}
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
-    def _figure(self, results: Results) -> Figure:
-        """The figure; where its numbers are not comparable it says so itself, since pictures lose their captions."""
+    def figure(self, results: Results) -> Figure:
+        """The figure; where its numbers are not comparable it says so itself, since pictures lose their captions.
+        Raises NotRun where it has no data."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
@@ -349,11 +345,6 @@ INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patchi
 def folder(kind: str, results: Results) -> str:
     """The folder of a kind, `tables` or `figures`; the paper's files are in a folder below it."""
     return kind if results.is_study else f"{kind}/{PAPER}"
-
-
-def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
-    """The files that a workspace keeps: all of a table, the PNG of a figure; `traps results export` writes the rest."""
-    return report.files(results) if isinstance(report, TableReport) else report.picture(results)
 
 
 def _say_below(figure: Figure, text: str) -> None:

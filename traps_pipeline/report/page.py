@@ -1,77 +1,78 @@
-"""The report page: leaderboards, then figures and tables of the study beside the paper's (docs/spec.md 10)."""
+"""The report page: findings, the leaderboard, what was run, and in one list what was not (docs/report.md)."""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import hashlib
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from traps_pipeline.report.cards import Address, Card, tables_html
 from traps_pipeline.report.leaderboard_page import leaderboards, legend, provenance
-from traps_pipeline.report.writing import Behind, PrintedTable, environment, table_html
+from traps_pipeline.report.study_findings import Finding
+from traps_pipeline.report.writing import TEMPLATES, environment
 
-WIDE_PX = 1300  # a picture with more pixels across gets the width of the page
-
-
-@dataclass(frozen=True)
-class Block:
-    """One side of a card: the source of the results, and a PNG (base64) or tables (title, escaped HTML)."""
-
-    source: str
-    png: str = ""
-    tables: Sequence[tuple[str, str]] = ()
-    size: str = "column"
-
-
-@dataclass(frozen=True)
-class Card:
-    """A figure, or tables, of the study beside the paper's. note: what it shows."""
-
-    name: str
-    title: str
-    blocks: Sequence[Block]
-    note: str = ""
+FIRST = "figure-pecs_landscape"  # beside the leaderboard
 
 
 def report_html(
     board: pd.DataFrame,
-    figures: Mapping[str, bytes] | None = None,
-    chapters: Sequence[tuple[str, Sequence[Card]]] = (),
-    address: Callable[[Behind], str] | None = None,
+    figures: Sequence[Card] = (),
+    pictures: Sequence[Card] = (),
+    tables: Sequence[Card] = (),
+    *,
+    findings: Sequence[Finding] = (),
+    address: Address | None = None,
+    explorer: str = "",
     title: str = "TRAPSBench report",
     robust: pd.DataFrame | None = None,
     said: Sequence[str] = (),
     terms: Mapping[str, str] | None = None,
 ) -> str:
-    """The page: leaderboard, figures (title -> PNG bytes, inlined), legend, one table per dataset, then the chapters.
+    """Render the report as one page that opens from disk and makes no network request.
 
-    robust: ROBUST rows, whose figures the leaderboard shows; said: further notes below it; terms: further words
-    of the legend. With `address`, every number is a link to the items behind it. The page opens from disk and makes no
-    network request; its content policy forbids any.
+    Parameters
+    ----------
+    board, robust
+        LEADERBOARD and ROBUST rows; `said` are further notes below the first leaderboard.
+    figures, pictures, tables
+        Cards. Those that were run are shown, tables in a collapsed appendix; of the others the reasons are listed.
+    address, explorer
+        With `address` every number is a link to the items behind it. `explorer` is the address of the explorer.
+    terms
+        Further words of the legend.
     """
+    boards = leaderboards(board, robust, said)
+    ranked = [table for table in boards if table.title == boards[0].title]  # one for each panel
+    others = [
+        Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(
+            own=tables_html([table], table.title, address), absent=[], published={}))
+        for table in boards if table not in ranked
+    ]  # fmt: skip
+    run = [[card for card in cards if card.html] for cards in (figures, pictures, [*others, *tables])]
+    absent: dict[str, list[str]] = {}
+    for card in (*figures, *pictures, *tables):
+        if not card.html:
+            absent.setdefault(card.why, []).append(card.title)
+    script = (TEMPLATES / "report.js").read_text(encoding="utf-8")
     return (
         environment()
         .get_template("report.html.j2")
         .render(
             title=title,
             provenance=provenance(board),
-            boards=[(table.title, table_html(table, address)) for table in leaderboards(board, robust, said)],
-            figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
-            chapters=chapters,
-            all_items=address(Behind()) if address else "",
+            explorer=explorer,
+            findings=findings,
+            boards=[{**table, "title": each.title} for each in ranked for table in tables_html([each], "", address)],
+            first=[card for card in run[0] if card.name == FIRST],
+            figures=[card for card in run[0] if card.name != FIRST],
+            pictures=run[1],
+            appendix=run[2],
+            absent={why: list(dict.fromkeys(titles)) for why, titles in absent.items()},
+            shown={"leaderboard", *(card.name for cards in run for card in cards)},
             legend={**legend(board, robust), **(terms or {})},
+            script=script,
+            script_digest=b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
         )
     )
-
-
-def picture_block(source: str, png: bytes, full: bool = False) -> Block:
-    """A picture as a card's block, one column or one page wide, which depends on the PNG's own width. full: as wide as
-    the screen allows."""
-    size = "full" if full else "page" if int.from_bytes(png[16:20], "big") > WIDE_PX else "column"
-    return Block(source, base64.b64encode(png).decode(), size=size)
-
-
-def table_block(source: str, tables: Sequence[PrintedTable], address: Callable[[Behind], str] | None) -> Block:
-    """Tables as a card's block."""
-    return Block(source, tables=[(table.title, table_html(table, address)) for table in tables])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report.contact_sheet import Layout, draw_pair, moments_of, ratio_of
-from traps_pipeline.report.writing import PAGE_IN, figure_style, new_figure, not_run_figure, plain
+from traps_pipeline.report.writing import PAGE_IN, figure_style, new_figure, plain
 from traps_pipeline.scoring.analyses import models_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 
@@ -26,12 +27,21 @@ FRAMES = Layout(block=3.0, header=0.62, gap=0.4, dpi=300, size=6.5, letters=64, 
 WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # of the column of words beside the frames
 
 
-def worked_example(workspace: Workspace) -> Figure:
-    """The figure of the pair that `chosen_example` takes from a study's verdicts under standard."""
+@dataclass(frozen=True)
+class Example:
+    """A pair (ITEMS rows indexed by side), a model, and the lines beside the frames of each side."""
+
+    pair: pd.DataFrame
+    model: str
+    words: Mapping[str, Sequence[str]]
+
+
+def worked_example(workspace: Workspace) -> Example | None:
+    """Return the example that `chosen_example` takes from a study's verdicts under standard; None if there is none."""
     verdicts = workspace.tables.read_all(VERDICTS, None, dataset=("occlusion", "chaotic"), regime="standard")
     chosen = chosen_example(verdicts)
     if chosen is None:
-        return not_run_figure("Worked example", "no pair has both answers judged under standard", PAGE_IN)
+        return None
     cell = Cell(chosen["dataset"], Evaluation(chosen["model"], "standard", int(chosen["run"])))
     tables = workspace.tables
     items = tables.read(ITEMS, {"dataset": cell.dataset})
@@ -44,7 +54,7 @@ def worked_example(workspace: Workspace) -> Figure:
         item = str(pair.at[side, "item_id"])
         on_item = [vote for vote in votes if vote["item_id"] == item]
         words[side] = reading(str(answers[item]["text"] or ""), on_item, rows[item])
-    return example_figure(pair, words, workspace.bring(pair["clip"]), str(chosen["model"]))
+    return Example(pair, str(chosen["model"]), words)
 
 
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
@@ -87,11 +97,9 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
     return [f"Answer: {answer}", f"Reading: {read}.", f"Verdict: {outcome}."]
 
 
-def example_figure(pair: pd.DataFrame, words: Mapping[str, Sequence[str]], root: Path, model: str) -> Figure:
-    """Frames of control and void at the left, the lines of `words` by side at the right; one page wide.
-
-    pair: ITEMS columns of both sides, indexed by side; clips lie under root.
-    """
+def example_figure(example: Example, root: Path) -> Figure:
+    """Draw frames of control and void at the left, the words at the right; one page wide. Clips lie under root."""
+    pair, words = example.pair, example.words
     with figure_style():
         block = moments_of(pair, root, FRAMES.moments)
         tall = FRAMES.block * ratio_of(block[0])
@@ -101,7 +109,7 @@ def example_figure(pair: pd.DataFrame, words: Mapping[str, Sequence[str]], root:
         axes = figure.add_axes((left / PAGE_IN, bottom / height, FRAMES.block / PAGE_IN, tall / height))
         draw_pair(axes, pair, *block, FRAMES)
         x = (left + FRAMES.block + 0.25) / PAGE_IN
-        figure.text(x, (bottom + tall + 0.12) / height, plain(model), size=7, weight="bold", parse_math=False)
+        figure.text(x, (bottom + tall + 0.12) / height, plain(example.model), size=7, weight="bold", parse_math=False)
         for side, top in (("control", bottom + tall), ("void", bottom + tall / 2 - 0.03)):
             fit: dict[str, Any] = {"max_lines": MOST_LINES, "placeholder": " …"}
             lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **fit)]

@@ -57,6 +57,10 @@ class Behind:
     side: str = ""
 
 
+class NotRun(Exception):
+    """A figure has no data; the message says why, for people."""
+
+
 Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> the items behind that number
 
 
@@ -362,21 +366,6 @@ def new_figure(
     return figure
 
 
-def not_run_figure(what: str, why: str, width: float = COLUMN_IN) -> Figure:
-    """The replacement for a figure without data: its name, `not run`, and why."""
-    import textwrap
-
-    with figure_style():
-        figure = new_figure(width, 1.1)
-        axes = figure.add_subplot()
-        axes.set_axis_off()
-        lines = textwrap.wrap(plain(f"{NOT_RUN}: {why}"), int(width * 17))
-        place: dict[str, Any] = {"ha": "center", "transform": axes.transAxes, "parse_math": False}
-        axes.text(0.5, 0.62, plain(what), weight="bold", va="bottom", **place)
-        axes.text(0.5, 0.5, "\n".join(lines), color=SOFT, va="top", **place)
-    return figure
-
-
 def freeze_layout(figure: Figure) -> None:
     """Run the layout engine once and remove it, since it would move the elements differently on every save."""
     with figure_style():
@@ -385,13 +374,13 @@ def freeze_layout(figure: Figure) -> None:
 
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
-    """The figure as a PDF, SVG or PNG file, without a date; the same bytes on every call."""
+    """The figure as a PDF, SVG, PNG or WebP file, without a date; the same bytes on every call."""
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
     with figure_style():
         if figure.get_layout_engine() is not None:
             freeze_layout(figure)
         stream = io.BytesIO()
-        figure.savefig(stream, format=kind, metadata=undated[kind])  # pyright: ignore[reportArgumentType]
+        figure.savefig(stream, format=kind, metadata=undated.get(kind))  # pyright: ignore[reportArgumentType]
     return stream.getvalue()
 
 

@@ -116,7 +116,8 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> 
     }
     for name, by_run in figures.items():
         ends = np.mean(by_run, axis=0)
-        values = ends[0, 0], *interval(ends[:, 1:], ends[0, 0], (0.0, 1.0))
+        value = ends[1, 0]  # without an unseen scenario both ends are the figure, the upper one with J clipped
+        values = value, *interval(ends[:, 1:], value, (0.0, 1.0))
         columns = (name, f"{name}_ci_low", f"{name}_ci_high")
         row |= dict.fromkeys(columns) if row["refused"] else dict(zip(columns, values, strict=True))
     inferred = items.loc[items["dataset"].isin(INFERENCE_ARMS)].groupby("run")[COUNTS].sum().reindex(list(runs))

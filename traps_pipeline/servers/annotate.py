@@ -31,7 +31,7 @@ from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, 
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
-SCRIPTS = ("dom.js", "player.js", "listening.js", "annotate.js")
+SCRIPTS = ("dom.js", "keys.js", "search.js", "player.js", "listening.js", "annotate.js")
 TITLES: Mapping[TaskName, str] = {
     "answerability": "Clips: what happens?",
     "abstention": "Answers: do they answer?",

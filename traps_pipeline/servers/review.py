@@ -31,7 +31,7 @@ from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, 
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
-SCRIPTS = ("dom.js", "player.js", "listening.js", "review.js")
+SCRIPTS = ("dom.js", "keys.js", "search.js", "player.js", "listening.js", "review.js")
 STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels
 Record = Mapping[str, Any]
 

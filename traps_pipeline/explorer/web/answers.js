@@ -56,7 +56,7 @@ async function answersView(route) {
   if (words) searchTexts(route, found, rows, words, status, list);
   else {
     status.textContent = `${count(rows.length)} of ${count(found.decisions.length)} answers`;
-    showAnswers(route, found, rows, "", list);
+    showAnswers(route, found, rows, [], list);
   }
   return {
     title: "Answers",
@@ -80,7 +80,7 @@ async function answersView(route) {
             name: "q",
             type: "search",
             value: words,
-            placeholder: "words of an answer, its reasoning or a rationale",
+            placeholder: 'words of an answer, its reasoning or a rationale; "in quotes" together',
           }),
           h("button", { type: "submit" }, "Search"),
         ),
@@ -115,33 +115,24 @@ async function answersView(route) {
   };
 }
 
-// Show rows in pages. matches: by row, where the words were found.
-function showAnswers(route, found, rows, words, list) {
+// Show rows in pages. terms: words to mark.
+function showAnswers(route, found, rows, terms, list) {
   const pages = Math.max(1, Math.ceil(rows.length / PAGE_ROWS));
   const page = Math.min(pages, Math.max(1, Number(route.parameters.page) || 1));
   const shown = rows.slice((page - 1) * PAGE_ROWS, page * PAGE_ROWS);
   TOUR.rows = rows;
-  list.replaceChildren(...shown.map((row) => answerLine(found, row, words)));
-  if (!rows.length) list.append(notice("No answer fits. Widen the filters above."));
-  if (pages > 1) {
-    const to = (target, text) =>
-      target < 1 || target > pages
-        ? h("span", { class: "button off" }, text)
-        : link(["answers"], { ...route.parameters, page: target === 1 ? "" : target }, text, { class: "button" });
-    list.append(
-      h(
-        "nav",
-        { class: "pages", "aria-label": "pages" },
-        to(page - 1, "Previous"),
-        ` page ${count(page)} of ${count(pages)} `,
-        to(page + 1, "Next"),
-      ),
-    );
-  }
+  list.replaceChildren(...shown.map((row) => answerLine(found, row, terms)));
+  if (!rows.length) list.append(notice(nothingFits(route.parameters)));
+  add(list, [pageLinks(route, page, pages)]);
+}
+
+function nothingFits({ q, page, ...filters }) {
+  if (q) return "No answer holds all these words. Leave some out; words in quotes must stand together.";
+  return Object.values(filters).some(Boolean) ? "No answer fits. Widen the filters above." : "This study has no answers yet.";
 }
 
 // One answer in a list; its text arrives when its shard is read.
-function answerLine(found, row, words) {
+function answerLine(found, row, terms) {
   const { info, items, pairs, pairOf, decisions } = found;
   const [item, evaluation] = [decisions.item[row], decisions.evaluation[row]];
   const pair = pairs[pairOf[item]];
@@ -149,7 +140,7 @@ function answerLine(found, row, words) {
   const text = h("div", { class: "excerpt" }, "…");
   afterPaint(() =>
     answer(row).then(
-      (read) => text.replaceChildren(excerpt(read, words)),
+      (read) => text.replaceChildren(excerpt(read, terms)),
       (error) => text.replaceChildren(notice(error.message, "error")),
     ),
   );
@@ -164,35 +155,36 @@ function answerLine(found, row, words) {
       chip(decision, kind),
       h("span", { class: "soft" }, `${evaluationName(info, evaluation)} · ${titleOf(info, pair.dataset)}`),
     ),
+    h("p", { class: "asked" }, untrusted(items.question[decisions.item[row]])),
     text,
   );
 }
 
 // The beginning of an answer, or the place of its text, reasoning or votes where the words stand.
-function excerpt(read, words) {
-  const low = words.toLowerCase();
+function excerpt(read, terms) {
   const places = [
     ["", read.text],
     ["reasoning: ", read.reasoning],
     ...read.votes.map((vote) => [`${vote.judge}: `, vote.rationale]),
   ];
-  const [label, text] = (low && places.find(([, each]) => each && each.toLowerCase().includes(low))) || places[0];
+  const { label, text, at: first } = bestPlace(places, terms);
   if (text === null || text === undefined)
     return h("span", { class: "absent" }, read.error ? `no text (${read.error})` : "no text");
-  const at = Math.max(0, low ? text.toLowerCase().indexOf(low) - 120 : 0);
-  const cut = text.slice(at, at + 320);
-  return [
+  const at = Math.max(0, first - 120);
+  return h(
+    "span",
+    null,
     label ? h("span", { class: "soft" }, label) : null,
     at ? "… " : null,
-    untrusted(cut, { found: low }),
+    untrusted(text.slice(at, at + 320), { terms }),
     at + 320 < text.length ? " …" : null,
-  ].reduce((box, part) => add(box, [part]), h("span"));
+  );
 }
 
 // Look for words in the texts of these rows, shard by shard; the list grows as they are found.
 async function searchTexts(route, found, rows, words, status, list) {
   const { info } = found;
-  const low = words.toLowerCase();
+  const terms = searchTerms(words);
   const byShard = new Map();
   for (const row of rows) {
     const number = shardOf(info, row);
@@ -207,8 +199,8 @@ async function searchTexts(route, found, rows, words, status, list) {
       const read = await shard(number);
       if (!route.isCurrent()) return;
       const before = matches.length;
-      for (const row of byShard.get(number)) if (mentions(read, row - read.first, low)) matches.push(row);
-      if (before < PAGE_ROWS && matches.length > before) showAnswers(route, found, matches, words, list);
+      for (const row of byShard.get(number)) if (mentions(read, row - read.first, terms)) matches.push(row);
+      if (before < PAGE_ROWS && matches.length > before) showAnswers(route, found, matches, terms, list);
       if (performance.now() - told > 100) {
         told = performance.now();
         status.textContent = `${count(matches.length)} found so far; ${Math.round((100 * (done + 1)) / numbers.length)} % of the texts read`;
@@ -216,18 +208,16 @@ async function searchTexts(route, found, rows, words, status, list) {
       }
     }
     status.textContent = `${count(matches.length)} of ${count(rows.length)} answers mention “${words}”`;
-    showAnswers(route, found, matches, words, list);
+    showAnswers(route, found, matches, terms, list);
   } catch (error) {
     status.replaceChildren(notice(error.message, "error"));
   }
 }
 
-function mentions({ texts, votes }, at, low) {
-  const holds = (text) => text && text.toLowerCase().includes(low);
-  if (holds(texts.text[at]) || holds(texts.reasoning[at])) return true;
-  for (let k = lowerBound(votes.answer, at); k < votes.length && votes.answer[k] === at; k++)
-    if (holds(votes.rationale[k])) return true;
-  return false;
+function mentions({ texts, votes }, at, terms) {
+  const own = [texts.text[at], texts.reasoning[at]];
+  for (let k = lowerBound(votes.answer, at); k < votes.length && votes.answer[k] === at; k++) own.push(votes.rationale[k]);
+  return holdsAll(own, terms);
 }
 
 function chip(text, kind) {

@@ -31,8 +31,10 @@ async function compareView(route) {
   const [info, found, differences, tests] = await Promise.all([study(), world(), contrasts(), regimeTests()]);
   const models = modelsOf(info);
   if (!models.length) return missingView("Compare", `${NOT_RUN}: this study has no answers yet.`);
-  const { left = models[0], decision = "void_abstention", run = "1" } = route.parameters;
-  const right = route.parameters.right ?? models.find((model) => model !== left) ?? left;
+  const known = (name) => (models.includes(route.parameters[name]) ? route.parameters[name] : undefined);
+  const left = known("left") ?? models[0];
+  const { decision = "void_abstention", run = "1" } = route.parameters;
+  const right = known("right") ?? models.find((model) => model !== left) ?? left;
   const regimesOf = (model) => info.regimes.filter((regime) => evaluationsOf(info, { model, regime }).length);
   const leftRegime = route.parameters.leftRegime || regimesOf(left)[0];
   const rightRegime =
@@ -51,6 +53,7 @@ async function compareView(route) {
   return {
     title: "Compare",
     body: [
+      unknownModels(info, route.parameters, ["left", "right"]),
       h(
         "div",
         { class: "filters" },
@@ -68,7 +71,7 @@ async function compareView(route) {
         choice(
           route,
           "decision",
-          "Whether it",
+          "Decision",
           COMPARED.map(({ id, title: text }) => [id, text]),
           { empty: null, fallback: decision },
         ),

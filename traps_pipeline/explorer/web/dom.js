@@ -42,30 +42,33 @@ function visible(text) {
 }
 
 // A text that somebody else wrote, in an element of its own that isolates its direction. A hidden character is shown
-// by its number, so that a reader sees what was said. found: a part to mark, in lower case.
-function untrusted(text, { tag = "span", found = "", ...attributes } = {}) {
+// by its number, so that a reader sees what was said. terms: words to mark, in lower case.
+/**
+ * @param {any} text
+ * @param {{tag?: string, terms?: string[], [attribute: string]: any}} [options]
+ */
+function untrusted(text, { tag = "span", terms = [], ...attributes } = {}) {
   const element = h(tag, { dir: "auto", ...attributes, class: `untrusted ${attributes.class || ""}`.trim() });
   const whole = String(text);
   let from = 0;
   for (const match of whole.matchAll(HIDDEN)) {
-    add(element, marked(whole.slice(from, match.index), found));
+    add(element, marked(whole.slice(from, match.index), terms));
     element.append(h("span", { class: "hidden-character", title: "a character that is not seen" }, numbered(match[0])));
     from = match.index + match[0].length;
   }
-  return add(element, marked(whole.slice(from), found));
+  return add(element, marked(whole.slice(from), terms));
 }
 
-function marked(text, found) {
-  if (!found) return [text];
-  const parts = [];
-  const low = text.toLowerCase();
-  let from = 0;
-  // A letter whose lower case has another length would shift what is marked: then nothing is.
-  for (let at = low.length === text.length ? low.indexOf(found) : -1; at >= 0; at = low.indexOf(found, from)) {
-    parts.push(text.slice(from, at), h("mark", null, text.slice(at, at + found.length)));
-    from = at + found.length;
-  }
-  return [...parts, text.slice(from)];
+function marked(text, terms) {
+  return terms.length ? markedParts(text, terms).map(([part, hit]) => (hit ? h("mark", null, part) : part)) : [text];
+}
+
+// An element of a drawing, as `h`.
+function s(tag, attributes, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes || {}))
+    if (value !== null && value !== undefined) element.setAttribute(name, value);
+  return add(element, children);
 }
 
 // Do something after what stands now was painted, so that reading files does not hold it up.

@@ -147,6 +147,12 @@ async function leaderboardView(route) {
           name: "leaderboard",
           order: { by: sort, down: !up },
           sortBy: change,
+          data: shown.map(({ own: row, paper: printed, model, regime: of }) => ({
+            model,
+            regime: of,
+            ...(row || {}),
+            ...Object.fromEntries(PAPER.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
+          })),
           foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
           absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
         }),

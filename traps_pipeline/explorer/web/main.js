@@ -7,6 +7,9 @@ const VIEWS = {
   answers: answersView,
   pair: pairView,
   compare: compareView,
+  landscape: landscapeView,
+  cases: casesView,
+  scenes: scenesView,
 };
 let shownRoute = null;
 let keysOfView = {};
@@ -54,13 +57,13 @@ async function show() {
   clearTimeout(waiting);
   if (!route.isCurrent()) return;
   const focused = document.activeElement && main.contains(document.activeElement) ? document.activeElement.id : "";
-  const heading = h("h1", { tabindex: "-1" }, view.title);
+  const heading = h("h1", { tabindex: "-1" }, view.heading || view.title);
   main.replaceChildren(...add(document.createDocumentFragment(), [heading, view.body]).childNodes);
   main.removeAttribute("aria-busy");
   shownRoute = route;
   keysOfView = view.keys || {};
   document.title = `${view.title} · ${document.documentElement.dataset.title}`;
-  for (const each of document.querySelectorAll("#views a")) {
+  for (const each of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("#views a[data-view]"))) {
     if (each.dataset.view === route.name) each.setAttribute("aria-current", "page");
     else each.removeAttribute("aria-current");
   }
@@ -73,24 +76,12 @@ async function show() {
   document.documentElement.dataset.shown = `${location.hash} ${(performance.now() - began).toFixed(1)}`;
 }
 
-document.addEventListener("keydown", (event) => {
-  if (
-    event.ctrlKey ||
-    event.metaKey ||
-    event.altKey ||
-    event.target.closest("input, select, textarea, button, summary")
-  )
-    return;
-  if (event.key === " " && event.target.closest("a")) return;
-  const act = keysOfView[event.key];
-  if (!act) return;
-  event.preventDefault();
-  act();
-});
+hearKeys(() => keysOfView);
+document.getElementById("copy").addEventListener("click", (event) => copyAddress(event.target));
 addEventListener("hashchange", show);
 document.getElementById("skip").addEventListener("click", (event) => {
   event.preventDefault(); // its address would be taken for a view
-  document.querySelector("main h1")?.focus();
+  /** @type {HTMLElement} */ (document.querySelector("main h1"))?.focus();
 });
 // What every other view needs is read after the first one was painted, when the browser has nothing else to do.
 const whenIdle = globalThis.requestIdleCallback || ((act) => setTimeout(act, 200));

@@ -4,6 +4,7 @@ async function pairView(route) {
   const [dataset, scenario] = route.path;
   const [info, found, about] = await Promise.all([study(), world(), scenarios()]);
   const place = found.pairs.findIndex((pair) => pair.dataset === dataset && pair.scenario === scenario);
+  if (!scenario) return missingView("Which pair?", "The address names no scenario: choose one under Scenes.");
   if (place < 0) return missingView(`No pair ${scenario} in ${dataset}`, "This study does not hold it.");
   const pair = found.pairs[place];
   const { items } = found;
@@ -51,12 +52,14 @@ async function pairView(route) {
   );
   return {
     title: scenario,
+    heading: untrusted(items.question[pair.control >= 0 ? pair.control : pair.void]),
     keys,
     body: [
       h(
         "p",
         { class: "lead" },
-        `${title} · ${pair.family} · `,
+        h("b", null, scenario),
+        ` · ${title} · ${pair.family} · `,
         link(["answers"], { dataset, scenario }, "all answers to this pair"),
         found.pairs
           .filter((other) => other.scenario === scenario && other !== pair)
@@ -80,7 +83,8 @@ async function pairView(route) {
           : h("span", { class: "button off" }, "Next pair"),
         h("span", { class: "soft keys" }, "Keys: space plays, ← → a frame, [ ] a pair"),
       ),
-      section(null, shown.element, questions(items, pair, sides, scene, captions)),
+      unknownModels(info, route.parameters, ["model", "model2"]),
+      section(null, questions(items, pair, sides, scene), shown.element),
       section(
         "Answers",
         h(
@@ -115,16 +119,15 @@ function follow(href) {
   if (href) location.hash = href.slice(1);
 }
 
-function questions(items, pair, sides, scene, captions) {
-  const asked = sides.map((side) => [side, items.question[pair[side]]]);
-  const same = asked.length === 2 && asked[0][1] === asked[1][1];
+// The question of the void where it is another than the heading's, and what is expected.
+function questions(items, pair, sides, scene) {
+  const asked = sides.map((side) => items.question[pair[side]]);
   return h(
     "dl",
     { class: "questions" },
-    (same ? [["", asked[0][1]]] : asked).map(([side, question]) => [
-      h("dt", null, side ? `Question of the ${side}` : "Question"),
-      h("dd", null, untrusted(question)),
-    ]),
+    asked.length === 2 && asked[0] !== asked[1]
+      ? [h("dt", null, "Question of the void"), h("dd", null, untrusted(asked[1]))]
+      : null,
     h("dt", null, "Expected"),
     h(
       "dd",
@@ -135,6 +138,13 @@ function questions(items, pair, sides, scene, captions) {
       scene.labels.length ? h("span", { class: "soft" }, ` (of ${scene.labels.join(", ")})`) : null,
     ),
   );
+}
+
+// A notice for each model of the address that this study did not ask; null where all were asked.
+function unknownModels(info, parameters, names) {
+  const asked = modelsOf(info);
+  const unknown = names.map((name) => parameters[name]).filter((model) => model && !asked.includes(model));
+  return unknown.length ? notice(`This study did not ask ${unknown.join(" and ")}.`, "error") : null;
 }
 
 // The evaluation that the address names; without one the first of its model and regime. Null where none is named.

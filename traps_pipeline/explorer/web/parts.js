@@ -73,9 +73,31 @@ function outcomeKey() {
   );
 }
 
-// A table in a box that scrolls. columns: {title, number, sort}; rows: arrays of cells (nodes or texts); the first cell
+// Links to the pages before and after this one; null where there is one page.
+function pageLinks(route, page, pages) {
+  if (pages < 2) return null;
+  const to = (target, text) =>
+    target < 1 || target > pages
+      ? h("span", { class: "button off" }, text)
+      : link([route.name], { ...route.parameters, page: target === 1 ? "" : target }, text, { class: "button" });
+  return h(
+    "nav",
+    { class: "pages", "aria-label": "pages" },
+    to(page - 1, "Previous"),
+    ` page ${count(page)} of ${count(pages)} `,
+    to(page + 1, "Next"),
+  );
+}
+
+// A table in a box that scrolls, with its CSV. columns: {title, number, sort}; rows: arrays of cells (nodes or texts); the first cell
 // heads its row. order: {by, down} and `sortBy` make headings sort. foot: rows below the others, which are never sorted.
-function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name = "", foot = [] } = {}) {
+// data: rows of numbers for the CSV, where the cells are not all there is.
+/**
+ * @param {any[]} columns
+ * @param {any[][]} rows
+ * @param {{caption?: string, order?: any, sortBy?: any, absent?: string, name?: string, foot?: any[], data?: any[]}} [options]
+ */
+function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name = "", foot = [], data = null } = {}) {
   const head = columns.map((column, k) => {
     const sorted = order && order.by === column.sort;
     const direction = sorted ? (order.down ? "descending" : "ascending") : null;
@@ -101,7 +123,7 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
       cells.map((cell, k) => h(k ? "td" : "th", { scope: k ? null : "row", class: classes(columns[k], k) }, cell)),
     );
   const empty = h("tr", null, h("td", { colspan: columns.length, class: "absent" }, absent));
-  return h(
+  const whole = h(
     "div",
     { class: "scroll", tabindex: "0", role: "region", "aria-label": caption || "table" },
     h(
@@ -113,6 +135,22 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
       foot.length ? h("tfoot", null, foot.map(line)) : null,
     ),
   );
+  const file = `${name || (caption || "table").toLowerCase().replace(/[^a-z0-9]+/g, "_")}.csv`;
+  const csv = () => save(file, data ? csvOfRows(data) : csvOfTable(whole));
+  return rows.length ? [whole, h("button", { type: "button", class: "save", onclick: csv }, "CSV")] : whole;
+}
+
+function csvOfRows(rows) {
+  const names = distinct(rows.flatMap((row) => Object.keys(row)));
+  return csvOf(names, rows.map((row) => names.map((name) => row[name])));
+}
+
+// The cells as they are shown; a column without a heading and text, such as one of bars, is left out.
+function csvOfTable(box) {
+  const read = (row) => [...row.children].map((cell) => cell.innerText.replace(/\s+/g, " ").trim());
+  const [head, ...rows] = [...box.querySelectorAll("thead tr, tbody tr, tfoot tr")].map(read);
+  const kept = head.flatMap((title, k) => (title ? [k] : []));
+  return csvOf(kept.map((k) => head[k]), rows.map((row) => kept.map((k) => row[k])));
 }
 
 function classes(column, place) {

@@ -16,6 +16,13 @@ async function addressOf(path) {
   }
 }
 
+// The address of a clip that the tables name.
+function clipAddress(path) {
+  return `${document.documentElement.dataset.clips || ""}${path}`;
+}
+
+let speed = 1; // stays for the next pair
+
 // clips: [{title, path, note}]; path is null where the folder has no such clip. fps: frames a second.
 function player(clips, fps, hasClips) {
   const videos = [];
@@ -29,7 +36,7 @@ function player(clips, fps, hasClips) {
       : "The clips were left out of this folder; `traps site` without --without-clips puts them in.";
     if (video) {
       videos.push(video);
-      addressOf(path).then((found) => video.setAttribute("src", found));
+      addressOf(clipAddress(path)).then((found) => video.setAttribute("src", found));
     }
     return h(
       "figure",
@@ -98,6 +105,7 @@ function player(clips, fps, hasClips) {
     playing = true;
     button.textContent = "Pause";
     const now = Number(slider.value);
+    for (const video of videos) video.playbackRate = speed;
     for (const video of videos) if (now < last(video)) video.play().catch(pause);
     requestAnimationFrame(follow);
   };
@@ -105,6 +113,17 @@ function player(clips, fps, hasClips) {
     pause();
     show(Math.min(frames - 1, Math.max(0, Number(slider.value) + by)));
   };
+  const speeds = h(
+    "select",
+    {
+      "aria-label": "speed",
+      onchange: () => {
+        speed = Number(speeds.value);
+        for (const video of videos) video.playbackRate = speed;
+      },
+    },
+    [0.25, 0.5, 1, 2].map((value) => h("option", { value, selected: value === speed }, `${value}×`)),
+  );
   for (const video of videos) {
     video.addEventListener("loadedmetadata", () => {
       frames = last(longest()) + 1;
@@ -123,6 +142,7 @@ function player(clips, fps, hasClips) {
       h("button", { type: "button", "aria-label": "one frame back", onclick: () => move(-1) }, "◂"),
       h("button", { type: "button", "aria-label": "one frame on", onclick: () => move(1) }, "▸"),
       slider,
+      speeds,
       place,
     ),
   );

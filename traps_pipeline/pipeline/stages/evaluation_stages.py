@@ -70,16 +70,18 @@ def _with_items(workspace: Workspace, cells: Iterator[tuple[Cell, Made]]) -> Ite
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
-    """Metadata about a cell's items: a table of those without an answer, and the page of all."""
-    from traps_pipeline.report.cell_pages import FOLDER, page_name
+    """Metadata about a cell's items: a table of those without an answer, and the explorer's view of all."""
+    from traps_pipeline.report.cards import explorer_address
+    from traps_pipeline.report.writing import Behind
 
-    page = workspace.reports / FOLDER / page_name(cell)
+    e = cell.evaluation
+    page, _, view = explorer_address(Behind(cell.dataset, e.model, e.regime)).partition("#")
     columns = ("item_id", "side", "outcome", "error", "attempts")
     without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
     records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
     why = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
-    return {**table, "all items": StudyFile(workspace.relative(page)), **why}
+    return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **why}
 
 
 def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:

@@ -30,7 +30,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steering_effects,
     steers,
 )
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS

@@ -10,8 +10,8 @@ from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
 from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

@@ -44,7 +44,7 @@ from traps_pipeline.pipeline.schemes import (
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category

@@ -9,7 +9,7 @@ from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts
 from traps_pipeline.pipeline.stages.judging_stages import confabulation
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

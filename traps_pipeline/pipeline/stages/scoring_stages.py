@@ -10,7 +10,7 @@ from traps_pipeline.pipeline.schemes import DATASET, by_dataset
 from traps_pipeline.pipeline.stage import of, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.pipeline.stages.pictures_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import rows_shown
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.scoring.score_rows import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made

@@ -16,9 +16,9 @@ from traps_pipeline.report.writing import (
     INK,
     PAGE_IN,
     SOFT,
+    NotRun,
     figure_style,
     new_figure,
-    not_run_figure,
     plain,
 )
 from traps_pipeline.scoring import analyses
@@ -36,7 +36,7 @@ def visual_textual(results: Results) -> Figure:
     asked; a second panel has the means by family."""
     rates = results.rates
     if not len(rates):
-        return not_run_figure("Visual against textual voids", results.why("rates"), PAGE_IN)
+        raise NotRun(results.why("rates"))
     models = list(dict.fromkeys(rates["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 2.9 + 0.13 * int(np.ceil(len(models) / 5)))
@@ -102,7 +102,7 @@ def abs_rec_by_model(results: Results) -> Figure:
     rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
     if not len(rows):
         why = "no model has all four datasets" if len(results.cells) else results.why("cells")
-        return not_run_figure("AbsRec, standard and guided", why)
+        raise NotRun(why)
     sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
     models = sorted(
         {m for m, _ in sides}, key=lambda m: (_abs_rec(sides, m, "standard"), _abs_rec(sides, m, "guided"), m)
@@ -145,7 +145,7 @@ def doubt(results: Results) -> Figure:
     large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title says why."""
     points, refused = doubt_points(results)
     if not len(points):
-        return not_run_figure("Doubt and conversion", refused or _no_doubt(results))
+        raise NotRun(refused or _no_doubt(results))
     look = looks(points["thinking"])
     with figure_style():
         figure = new_figure(COLUMN_IN, 2.6)

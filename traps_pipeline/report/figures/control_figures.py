@@ -23,10 +23,10 @@ from traps_pipeline.report.writing import (
     INK,
     PAGE_IN,
     SOFT,
+    NotRun,
     figure_style,
     fraction,
     new_figure,
-    not_run_figure,
     plain,
 )
 
@@ -47,7 +47,7 @@ def probe_baselines(results: Results) -> Figure:
     fewer than ten items a side. A probe shows what the states add only as far as it is above all coloured marks."""
     rows = beside(results)
     if not len(rows):
-        return not_run_figure("Probes and their baselines", why(results), PAGE_IN)
+        raise NotRun(why(results))
     from matplotlib.lines import Line2D
 
     models = list(dict.fromkeys(rows["model"]))
@@ -101,7 +101,7 @@ def gate_arrows(results: Results) -> Figure:
     rows = rows.loc[rows["features"].isin(_FEATURES)]
     if not len(rows):
         absent = why(results) if results.is_study else "the paper gates nothing"
-        return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
+        raise NotRun(absent)
     from matplotlib.lines import Line2D
 
     regimes = [name for name in PROMPTING if name in set(rows["regime"])]
@@ -161,7 +161,7 @@ def patching(results: Results) -> Figure:
     rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
     if not len(rows):
         absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
-        return not_run_figure("Activation patching", absent, PAGE_IN)
+        raise NotRun(absent)
     sites = [site for site in SITES if site in set(rows["site"])]
     cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
     alone = len(sites) == 1  # then cases stand side by side; else a line has the sites of one case
@@ -228,7 +228,7 @@ def doses_among_nulls(results: Results) -> Figure:
     rows = results.own_effects
     if not len(rows):
         absent = why(results) if results.is_study else "the paper has no such nulls"
-        return not_run_figure("Doses among nulls", absent, PAGE_IN)
+        raise NotRun(absent)
     from matplotlib.lines import Line2D
 
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))

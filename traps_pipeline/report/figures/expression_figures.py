@@ -11,7 +11,7 @@ from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING, STANDARD
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.steering_tables import why
-from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, figure_style, new_figure, not_run_figure, plain
+from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, NotRun, figure_style, new_figure, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,7 @@ def states_and_output(results: Results) -> Figure:
     rows = scored_items(results)
     if not len(rows):
         absent = why(results) if results.is_study else "the paper prints no scores of items"
-        return not_run_figure("States against output, item by item", absent, PAGE_IN)
+        raise NotRun(absent)
     from matplotlib.lines import Line2D
 
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
@@ -104,7 +104,7 @@ def lens(results: Results) -> Figure:
     rows = results.lens
     if not len(rows):
         absent = why(results) if results.is_study else "the paper has no such curves"
-        return not_run_figure("The margin by layer", absent, PAGE_IN)
+        raise NotRun(absent)
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator
 

@@ -9,7 +9,7 @@ import numpy as np
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
+from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def sub_scenarios(results: Results) -> Figure:
     rows = results.sub_scenarios
     rows = rows.loc[rows["abs_rec"].notna()]
     if not len(rows):
-        return not_run_figure("AbsRec by sub-scenario", results.why("sub_scenarios"), PAGE_IN)
+        raise NotRun(results.why("sub_scenarios"))
     rows = rows.assign(order=rows["dataset"] != "occlusion").sort_values(
         ["order", "abs_rec", "sub_scenario"], ascending=[True, False, True]
     )
@@ -96,7 +96,7 @@ def confabulation(results: Results) -> Figure:
     rows = results.confabulation
     if not len(rows):
         why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
-        return not_run_figure("Prevalence of confabulation", why or results.why("confabulation"), PAGE_IN)
+        raise NotRun(why or results.why("confabulation"))
     at, width = np.arange(len(rows)), 0.16
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)

@@ -16,10 +16,10 @@ from traps_pipeline.report.writing import (
     COLUMN_IN,
     INK,
     PAGE_IN,
+    NotRun,
     figure_style,
     freeze_layout,
     new_figure,
-    not_run_figure,
 )
 from traps_pipeline.scoring import analyses
 
@@ -35,7 +35,7 @@ def landscape(results: Results) -> Figure:
     if len(overall):
         return landscape_figure(overall, TITLES["overall"])
     if not len(cells):
-        return not_run_figure("PECS landscape", results.why("cells"))
+        raise NotRun(results.why("cells"))
     first = datasets_of(cells)[0]
     points = cells.loc[cells["dataset"] == first]
     return landscape_figure(points.assign(j=points["abs_rec"] - points["false_abs"]), TITLES[first])
@@ -72,7 +72,7 @@ def reasoning(results: Results) -> Figure:
     chains = [chain for chain in chains if len(chain) > 1]
     if not chains:
         why = "no reasoning pair has all four datasets" if results.is_study else results.why("cells")
-        return not_run_figure("Reasoning in PECS space", why, PAGE_IN)
+        raise NotRun(why)
     named = points.loc[points["model"].isin([m for chain in chains for m in chain])]
     with figure_style():
         figure = new_figure(PAGE_IN, 3.5)

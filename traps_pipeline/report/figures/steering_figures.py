@@ -15,7 +15,7 @@ from traps_pipeline.report.figures.looks import from_to
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.probe_tables import best_layers
 from traps_pipeline.report.tables.steering_tables import why
-from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
+from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,7 +74,7 @@ def probe_curves(results: Results) -> Figure:
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
-        return not_run_figure("Probe transfer by layer", why(results), PAGE_IN)
+        raise NotRun(why(results))
     models = list(dict.fromkeys(curves["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 0.65 + 1.75 * len(models))
@@ -126,7 +126,7 @@ def confabulated_strip(results: Results) -> Figure:
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
         absent = "no dataset has confabulated voids" if len(rows) else why(results)
-        return not_run_figure("Cf→Cf probes", absent, PAGE_IN)
+        raise NotRun(absent)
     models = list(dict.fromkeys(rows["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)
@@ -167,7 +167,7 @@ def dose_response(results: Results) -> Figure:
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
     if not panels:
-        return not_run_figure("Dose and response", why(results), PAGE_IN)
+        raise NotRun(why(results))
     across = 2 if len(panels) > 1 else 1
     lines = -(-len(panels) // across)
     with figure_style():
@@ -245,7 +245,7 @@ def cosine_heatmaps(results: Results) -> Figure:
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):
-        return not_run_figure("Cosines of void directions", why(results), PAGE_IN)
+        raise NotRun(why(results))
     panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
     several = len({prompt for _, prompt, _ in panels}) > 1
     columns = min(3, len(panels))

@@ -138,7 +138,7 @@ def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 def interval(row: Mapping[str, Any]) -> str:
     """The interval of PECS as printed; empty if there is none."""
-    low, high = row["pecs_ci_low"], row["pecs_ci_high"]
+    low, high = row.get("pecs_ci_low"), row.get("pecs_ci_high")
     return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
 
 
@@ -146,8 +146,8 @@ def ranks(row: Mapping[str, Any]) -> str:
     """The range of ranks that contrasts do not separate, as printed."""
     import pandas as pd
 
-    low, high = row["rank_low"], row["rank_high"]
-    return "" if pd.isna(low) else f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}"
+    low, high = row.get("rank_low"), row.get("rank_high")
+    return "" if low is None or pd.isna(low) else f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}"
 
 
 def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:

@@ -22,9 +22,8 @@ from traps_pipeline.scenes.certification.certificates import (
     settled_answer,
     shown_points,
 )
-from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.wording import false_premise
-from traps_pipeline.scenes.physics.kit import Inventory, Physics, View
+from traps_pipeline.scenes.physics.kit import View
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import PANEL_HALF_THICKNESS, Panel, fit_camera
@@ -215,7 +214,7 @@ def _late_panel(scenario: Scenario) -> Take:
 
 
 def _length_matched(scenario: Scenario) -> Take:
-    """The control's last frames before it closes, as many as the void has; the observer answers from them."""
+    """The control's last open frames, as many as the void has; the observer answers from them."""
     spec, family, end = scenario.spec, scenario.control.family, scenario.control.open_frames
     frames = scenario.control_frames[end - spec.void["cut_frame"] : end]
     assert family.observe is not None, f"{family.name}: has no observer"
@@ -295,10 +294,9 @@ def crossed(partner: SceneSpec | None) -> Arm:
 
     def film(scenario: Scenario) -> Take:
         foreign = ask(scenario.spec)[1].text
-        why = false_premise(foreign, scenario.control.inventory)
-        if why is None:
-            raise Rejected(f"the scene does not refute {foreign!r}")
-        return Take([], {"refuted_by": why})
+        if why := false_premise(foreign, scenario.control.inventory):
+            return Take([], {"refuted_by": why})
+        raise Rejected(f"the scene does not refute {foreign!r}")
 
     return Arm(
         CROSSED,
@@ -317,7 +315,7 @@ def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
     Scenarios with the fewest candidates choose first, which leaves few without a partner.
     """
     by_id = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
-    seen = {id_: _inventory(spec) for id_, spec in by_id.items()}
+    seen = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in by_id.items()}
     refuted = {(a, b) for a in by_id for b in by_id if false_premise(by_id[b].question, seen[a]) is not None}
     free = {a: {b for b in by_id if (a, b) in refuted and (b, a) in refuted} for a in by_id}
     chosen: dict[str, str] = {}
@@ -327,11 +325,6 @@ def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
         chosen |= {a: b, b: a}
         free = {one: others - {a, b} for one, others in free.items() if one not in (a, b)}
     return chosen
-
-
-def _inventory(spec: SceneSpec) -> Inventory:
-    family = get_family(spec.family)
-    return family.build(family.params_from(spec.params), Physics(**spec.physics)).inventory
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 // One thing to label: a clip or an answer, a key for each decision.
 
 const material = field("material");
+/** @type {Record<string, () => any>} */
 let keys = {};
 
 // --- what is shown ----------------------------------------------------------------------------------------------------
@@ -53,7 +54,7 @@ async function back() {
 
 function give() {
   if (SHOWN.task !== "answerability") {
-    const boxes = [...document.querySelectorAll(".axes input")];
+    const boxes = [.../** @type {NodeListOf<HTMLInputElement>} */ (document.querySelectorAll(".axes input"))];
     return decide(Object.fromEntries(boxes.map((box) => [box.id, box.checked])));
   }
   const answer = field("answer").value.trim();
@@ -62,12 +63,12 @@ function give() {
   return field("answer").focus();
 }
 
-for (const button of document.querySelectorAll("button[data-label]")) {
+for (const button of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("button[data-label]"))) {
   const act = () => decide(JSON.parse(button.dataset.label));
   button.addEventListener("click", act);
   keys[button.dataset.key] = act;
 }
-for (const box of document.querySelectorAll(".axes input"))
+for (const box of /** @type {NodeListOf<HTMLInputElement>} */ (document.querySelectorAll(".axes input")))
   keys[box.dataset.key] = () => {
     box.checked = !box.checked;
   };
@@ -78,4 +79,4 @@ if (field("unknown")) {
 } else if (field("give")) keys.Enter = give;
 keys.u = back;
 field("back").addEventListener("click", back);
-hearKeys(keys, (event) => event.key === "Enter" && event.target.id === "answer" && (give() || true));
+listen(keys, (event) => event.key === "Enter" && event.target.id === "answer" && (give() || true));

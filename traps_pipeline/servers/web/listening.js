@@ -1,6 +1,7 @@
 // What the pages that listen share: what the server put into the page, sending decisions, hearing keys.
 
 const SHOWN = JSON.parse(document.getElementById("shown").textContent);
+/** @type {(name: string) => any} */
 const field = (name) => document.getElementById(name);
 
 // Send JSON and return what the server says. Throws an Error with its sentence where it refuses.
@@ -17,18 +18,18 @@ async function post(path, body) {
   return read;
 }
 
-// Hear keys by name. first: what is tried before, and returns true where the key was meant for it.
-function hearKeys(keys, first = () => false) {
-  document.addEventListener("keydown", (event) => {
-    if (event.key === "Escape") return document.activeElement.blur();
-    if (first(event)) return null;
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=range]), textarea, select"))
-      return null;
-    if ((event.key === " " || event.key === "Enter") && event.target.closest("a, button, summary")) return null;
-    const act = keys[event.key];
-    if (!act) return null;
-    event.preventDefault();
-    return act();
-  });
+// Hear keys and say so. first: what is tried before, and returns true where the key was meant for it.
+/**
+ * @param {Record<string, () => any>} keys
+ * @param {(event: any) => any} [first]
+ */
+function listen(keys, first = () => false) {
+  hearKeys(
+    () => keys,
+    (event) => {
+      if (event.key === "Escape") /** @type {HTMLElement} */ (document.activeElement).blur();
+      return event.key === "Escape" || first(event);
+    },
+  );
   document.documentElement.dataset.ready = "1"; // from here on keys are heard
 }

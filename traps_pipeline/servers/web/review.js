@@ -84,8 +84,8 @@ async function decide(action) {
   const why = field("why").value.trim();
   if (!why) {
     wanted = action;
-    said.textContent = `Write the reason to ${action}, then press Enter.`;
-    field("why").focus();
+    said.textContent = `To ${action} needs a reason: press w, write it, then press Enter.`;
+    said.classList.add("error");
     return;
   }
   sessionStorage.setItem("why", why);
@@ -134,4 +134,4 @@ for (const name of ["keep", "correct", "discard", "add", "undo"])
   field(name).addEventListener("click", () => decide(name));
 field("before").addEventListener("click", KEYS.p);
 field("after").addEventListener("click", KEYS.n);
-hearKeys(KEYS, (event) => event.key === "Enter" && event.target.id === "why" && decide(wanted || "keep"));
+listen(KEYS, (event) => event.key === "Enter" && event.target.id === "why" && decide(wanted || "keep"));

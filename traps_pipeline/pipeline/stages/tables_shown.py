@@ -1,4 +1,4 @@
-"""Previews of tables and pictures for Dagster's UI."""
+"""Previews of tables for Dagster's UI."""
 
 import math
 from typing import TYPE_CHECKING
@@ -7,8 +7,6 @@ from traps_pipeline.pipeline.previews import Markdown
 
 if TYPE_CHECKING:
     import pandas as pd
-
-THUMBNAIL_WIDTH = 480  # px, about 15 KB in an event; the full picture is in the reports folder
 
 
 def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> Markdown | str:
@@ -19,21 +17,6 @@ def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> Markdown | str:
     lines = [[str(name) for name in head.columns], ["---"] * len(head.columns)]
     lines += [[_plain(value) for value in row] for row in head.itertuples(index=False)]
     return Markdown("\n".join("| " + " | ".join(line) + " |" for line in lines))
-
-
-def thumbnail(png: bytes) -> Markdown:
-    """A small JPEG of a picture."""
-    import base64
-
-    import cv2
-    import numpy as np
-
-    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None, "our own PNG"
-    scale = min(1.0, THUMBNAIL_WIDTH / picture.shape[1])
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
-    return Markdown(f"![preview](data:image/jpeg;base64,{base64.b64encode(jpeg).decode()})")
 
 
 def _plain(value: object) -> str:

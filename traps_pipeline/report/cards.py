@@ -1,0 +1,149 @@
+"""The parts of the report page: a card for each table, figure and picture of pairs, the study's beside the paper's."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+from urllib.parse import urlencode
+
+from traps_pipeline.base.sheets import csv_bytes
+from traps_pipeline.report.catalogue import FigureReport, TableReport
+from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.study_results import StudyResults
+from traps_pipeline.report.writing import (
+    COLUMN_IN,
+    Behind,
+    NotRun,
+    PrintedTable,
+    environment,
+    figure_bytes,
+    table_html,
+    table_latex,
+)
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+EXPLORER = "index.html"  # beside the report page
+MEDIA = {"svg": "image/svg+xml", "webp": "image/webp", "csv": "text/csv", "tex": "application/x-tex"}
+Address = Callable[[Behind], str]
+
+
+@dataclass(frozen=True)
+class Card:
+    """A part of the page. html: escaped, empty if the part was not run; why: then the reason."""
+
+    name: str
+    title: str
+    html: str = ""
+    why: str = ""
+
+    @classmethod
+    def read(cls, data: bytes) -> Card:
+        """Return the card that `data` wrote."""
+        return cls(**json.loads(data))
+
+    @property
+    def data(self) -> bytes:
+        """The card as JSON."""
+        return json.dumps(asdict(self)).encode()
+
+
+class Sources:
+    """The results of a study and of the paper, read when a card first needs them."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+
+    @cached_property
+    def study(self) -> Results:
+        """The study's results."""
+        return StudyResults(self.workspace)
+
+    @cached_property
+    def paper(self) -> Results:
+        """The paper's results."""
+        return PublishedResults()
+
+
+def explorer_address(behind: Behind) -> str:
+    """Return the address of the explorer's view of the answers behind a number."""
+    query = {name: value for name, value in vars(behind).items() if value}
+    return f"{EXPLORER}#/answers" + (f"?{urlencode(query)}" if query else "")
+
+
+def table_card(report: TableReport, sources: Sources, address: Address | None = explorer_address) -> Card:
+    """Return the card of a study's tables, with the paper's of the kind."""
+    name, tables = f"table-{report.name}", report.tables(sources.study)
+    title = report.title or tables[0].title
+    run = [table for table in tables if len(table.rows) or table.none]
+    if not run:
+        return Card(name, title, why=tables[0].why)
+    absent = [f"{table.title}: {table.absence}" for table in tables if table not in run]
+    published = {"As the paper prints it": report.as_printed()} if report.paper else {}
+    if report.recomputed:
+        published["Recomputed from the published tables"] = report.tables(sources.paper)
+    return Card(name, title, _fragment("tables", own=tables_html(run, title, address), absent=absent,
+                published={words: tables_html(each, "", None) for words, each in published.items()}))  # fmt: skip
+
+
+def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
+    """Return title (where it differs from the card's), fragment and downloads by file name of each table."""
+    return [
+        {
+            "title": table.title if table.title != title else "",
+            "html": table_html(table, address),
+            "files": {
+                f"{table.name}.csv": data_address("csv", csv_bytes(table.data)),
+                f"{table.name}.tex": data_address("tex", table_latex(table).encode()),
+            },
+        }
+        for table in tables
+    ]
+
+
+def figure_card(report: FigureReport, sources: Sources) -> Card:
+    """Return the card of a study's figure, with the paper's."""
+    name = f"figure-{report.name}"
+    try:
+        own = report.figure(sources.study)
+    except NotRun as reason:
+        return Card(name, report.title, why=str(reason))
+    pictures = {"": _picture(report.name, own)}
+    if report.published:
+        with suppress(NotRun):
+            pictures["The paper’s"] = _picture(f"{report.name}_published", report.figure(sources.paper))
+    return Card(
+        name, report.title, _fragment("figures", pictures=pictures, alt=report.title, shows=report.note(sources.study))
+    )
+
+
+def picture_card(name: str, title: str, make: Callable[[], Mapping[str, Figure]], kind: str) -> Card:
+    """Return the card of pictures made from clips, by file name. kind: "webp" where they show frames, else "svg"."""
+    try:
+        pictures = {"" if not k else f"{k + 1}": _picture(each, figure, kind) for k, (each, figure) in
+                    enumerate(make().items())}  # fmt: skip
+    except NotRun as reason:
+        return Card(name, title, why=str(reason))
+    return Card(name, title, _fragment("figures", pictures=pictures, alt=title, shows=""))
+
+
+def _picture(name: str, figure: Figure, kind: str = "svg") -> Mapping[str, str]:
+    width = "column" if figure.get_figwidth() <= COLUMN_IN else "page"
+    return {"name": name, "kind": kind, "width": width, "src": data_address(kind, figure_bytes(figure, kind))}
+
+
+def data_address(kind: str, content: bytes) -> str:
+    """Return a file as an address that holds its content."""
+    return f"data:{MEDIA[kind]};base64,{b64encode(content).decode('ascii')}"
+
+
+def _fragment(kind: str, **values: object) -> str:
+    return environment().get_template(f"{kind}.html.j2").render(**values)

@@ -1,0 +1,125 @@
+"""Pictures of pairs for the report: six pairs, one scenario with its arms, a worked example, shortcuts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.report.arms_sheet import arms_sheets
+from traps_pipeline.report.contact_sheet import PAGE, pairs_figure, six_pairs
+from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
+from traps_pipeline.report.worked_example import Example, example_figure, worked_example
+from traps_pipeline.report.writing import NotRun
+from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, VIDEOS
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.video.encode import DamagedClip
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+T = TypeVar("T")
+NO_ITEMS = "this study has no items yet"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One or several figures made from clips.
+
+    Parameters
+    ----------
+    make
+        Returns the figures by file name. Raises NotRun, and TrapsError for a damaged clip.
+    reads
+        The stages that they are made from.
+    inputs
+        The rows that they show, as JSON; null where all rows of the stages matter.
+    kind
+        How the page holds them: "webp" where they show frames, else "svg".
+    """
+
+    name: str
+    title: str
+    make: Callable[[], Mapping[str, Figure]]
+    reads: tuple[str, ...]
+    inputs: Any = None
+    kind: str = "webp"
+
+
+class PairPictures:
+    """The pictures of a study."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+
+    @cached_property
+    def items(self) -> pd.DataFrame:
+        """ITEMS rows of the pairs."""
+        return self.workspace.tables.read_all(ITEMS, dataset=DATASETS)
+
+    @cached_property
+    def arms(self) -> pd.DataFrame:
+        """ARMS rows."""
+        return self.workspace.tables.read_all(ARMS)
+
+    def all(self) -> list[Picture]:
+        """Return all pictures."""
+        visual = self.items.loc[self.items["dataset"].isin(["occlusion", "chaotic"])] if len(self.items) else self.items
+        six = six_pairs(self.items) if len(self.items) else self.items
+        example = worked_example(self.workspace)
+        shown = [_as_json(example.pair), example.model, example.words] if example else []
+        return [
+            Picture("worked_example", "Worked example: a pair, the answers, the panel’s reading, the verdicts",
+                    lambda: {"worked_example": self._example(example)},
+                    ("items", "responses", "votes", "verdicts"), shown),
+            Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(six)},
+                    ("items",), _as_json(six)),
+            Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),
+                    [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
+            Picture("shortcuts", "How well one cue alone separates control from void (0.5 is chance)",
+                    lambda: {"shortcuts": self._shortcuts()}, ("items", "videos"), kind="svg"),
+        ]  # fmt: skip
+
+    def _example(self, example: Example | None) -> Figure:
+        if example is None:
+            raise NotRun("no pair has both answers judged under standard")
+        return _readable(lambda: example_figure(example, self.workspace.bring(example.pair["clip"])))
+
+    def _six(self, rows: pd.DataFrame) -> Figure:
+        if not len(rows):
+            raise NotRun(NO_ITEMS)
+        return _readable(lambda: pairs_figure(rows, self.workspace.bring(rows["clip"]), None, 3, PAGE))
+
+    def _arms(self) -> Mapping[str, Figure]:
+        clips = [*self.items["clip"], *self.arms["clip"].dropna()] if len(self.arms) else []
+        sheets = _readable(lambda: arms_sheets(self.items, self.arms, self.workspace.bring(clips))) if clips else {}
+        if not sheets:
+            raise NotRun("no arm was filmed in this study")
+        return sheets
+
+    def _shortcuts(self) -> Figure:
+        from traps_pipeline.benchmark.shortcuts import shortcuts
+
+        if not len(self.items):
+            raise NotRun(NO_ITEMS)
+        videos = self.workspace.tables.read_all(VIDEOS)
+        return shortcut_figure(
+            _readable(lambda: shortcuts(self.items, videos, self.workspace.bring(self.items["clip"])))
+        )
+
+
+def _readable(make: Callable[[], T]) -> T:
+    """Return what is made of clips. Raises TrapsError where one is damaged."""
+    try:
+        return make()
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+
+
+def _as_json(rows: pd.DataFrame) -> str:
+    """The rows without the benchmark's version, which a correction changes in rows that it does not touch."""
+    return str(rows.drop(columns=["benchmark_version"], errors="ignore").to_json(orient="records"))

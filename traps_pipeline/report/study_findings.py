@@ -1,0 +1,161 @@
+"""What a study found, in sentences: the first thing on its report. Every number is one of the report's tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
+from traps_pipeline.report.catalogue import FIGURES
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import interval, ranks
+from traps_pipeline.report.writing import fraction, percent
+from traps_pipeline.scoring.analyses import models_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ASKED = {STANDARD: "Asked plainly (standard)", GUIDED: "Told not to guess (guided)"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence, and the name of the card with its numbers."""
+
+    text: str
+    card: str
+
+
+def study_findings(results: Results) -> list[Finding]:
+    """Return the findings of a study, the most important first; none if it has no overall figures.
+
+    Reference strategies, whose score is known, are left out where any other model was asked.
+    """
+    overall = results.overall
+    rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
+    if not len(rows):
+        return []
+    references = models_of(group="reference")
+    own = rows.loc[[model not in references for model in rows["model"]]]
+    own = own if len(own) else rows
+    inside = [(report.name, report.finding(results)) for report in FIGURES] if results.mechanism else []
+    return [
+        *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
+        *_missing(own), *(Finding(text, f"figure-{name}") for name, text in inside if text),
+    ]  # fmt: skip
+
+
+def _best(rows: pd.DataFrame) -> Iterator[Finding]:
+    """The best model of each regime, and how many others the contrasts cannot tell from it."""
+    for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
+        part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
+        first = part.to_dict("records")[0]
+        figure = fraction(first["pecs"])
+        equal, others = ([*part.loc[part["pecs"].map(fraction).eq(figure) == same, "model"]] for same in (True, False))
+        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if others else "has a PECS of"
+        text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
+        if others:
+            text += f", before {others[0]} with {fraction(part.loc[part['model'] == others[0], 'pecs'].iloc[0])}"
+        alike = ranks(first)
+        if len(equal) == 1 and "–" in alike:
+            text += f"; its rank may be {alike}, since contrasts do not separate it from others"
+        yield Finding(f"{text}.", "leaderboard")
+
+
+def _names(models: list[str]) -> str:
+    """Up to three names, and how many more."""
+    shown, more = models[:3], len(models) - 3
+    parts = [*shown, f"{more} more"] if more > 0 else shown
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def _abstention(rows: pd.DataFrame) -> Iterator[Finding]:
+    for regime, words in ASKED.items():
+        part = rows.loc[rows["regime"] == regime]
+        if len(part):
+            who = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
+            voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
+            yield Finding(
+                f"{words}, {who} on {voids} of the voids, which cannot be answered, and on {controls} of the "
+                "controls, which can.",
+                "figure-abs_rec",
+            )
+
+
+def _accuracy(rows: pd.DataFrame) -> Iterator[Finding]:
+    """By how much guided prompting changes Acc and AbsRec of the models that were asked both ways."""
+    wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
+    if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
+        changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
+        acc, voids = (_points(changes[name]) for name in ("acc", "abs_rec"))
+        yield Finding(
+            f"Guided prompting changes abstention on voids by {voids} points, and accuracy on controls by {acc}.",
+            "table-guided_uplift",
+        )
+
+
+def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
+    """Visual against textual voids, and the part of PECS that may come from shortcuts."""
+    rates = results.rates
+    pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
+    pooled = pooled.dropna(subset=["visual", "textual"])
+    if len(pooled):
+        textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
+        who = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
+        yield Finding(
+            f"Asked plainly, {who} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
+            f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
+            f"{' (means)' if len(pooled) > 1 else ''}.",
+            "figure-visual_textual",
+        )
+    robust = results.robust
+    robust = robust.loc[robust["model"].isin(rows["model"])].dropna(subset=["conjunction"]) if len(robust) else robust
+    if len(robust):
+        most = robust.sort_values(["conjunction", "model"], ascending=[False, True]).to_dict("records")[0]
+        yield Finding(
+            f"Control, twin, void and crossed questions of one scene are all right in at most "
+            f"{percent(most['conjunction'])} % of the scenes ({most['model']} under {most['regime']}).",
+            "leaderboard",
+        )
+
+
+def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
+    contrasts = results.contrasts
+    if len(contrasts):
+        models = contrasts["left_model"].isin(rows["model"]) & contrasts["right_model"].isin(rows["model"])
+        of = contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
+        tested = contrasts.loc[models & of & contrasts["difference"].notna()]
+        if len(tested):
+            count = int(tested["separable"].eq(True).sum())
+            yield Finding(
+                f"Of {len(tested)} differences of PECS between models under one regime, {count} "
+                f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
+                "table-contrasts",
+            )
+
+
+def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
+    missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
+    if missing:
+        asked = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
+        most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
+        yield Finding(
+            f"{missing} of {asked} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
+            f"most, {int(most['n_missing'])}.",
+            "leaderboard",
+        )
+
+
+def _span(shares: pd.Series) -> str:
+    """The smallest and the largest share in percent, once if they print alike."""
+    low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
+    return f"{low} %" if low == high else f"{low} to {high} %"
+
+
+def _points(changes: pd.Series) -> str:
+    """The smallest and the largest change in points of percent, with their signs."""
+    low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
+    return low if low == high else f"{low} to {high}"
