@@ -50,7 +50,7 @@ def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
     why = read(small, "why", ITEM)
     assert why["item"] == ITEM and {"evaluation", "state", "answers", "votes"} == {*why["evaluations"][0]}
     run = read(small, "run", EXPERIMENT)
-    assert {row["model"] for row in run["leaderboard"]} == {"oracle", "always-abstain", "prior"}
+    assert {row["model"] for row in run["leaderboard"]} == {"oracle", "random-50", "prior"}
     assert run["run"]["problems"] == []
     status = read(small, "status", EXPERIMENT)
     assert status["checks"] == [] and status["command"] == f"traps run {EXPERIMENT}"

@@ -128,7 +128,7 @@ def test_a_terminal_has_one_region_at_its_bottom_that_leaves_nothing_behind(
         report.asking("responses", {f"a-model-with-a-rather-long-name-{n}": (12345, 0) for n in range(30)})
         report.called("a-model-with-a-rather-long-name-7", True, 12.3, 1000.0)
         report.note(WORDS)
-        report._live.refresh()
+        report.beat()
         screen.feed(read_all(ours))
         report.partition("confabulation_votes", "a", Tally(asked=1))
         report.close()
@@ -142,3 +142,26 @@ def test_a_terminal_has_one_region_at_its_bottom_that_leaves_nothing_behind(
     assert screen.widest <= columns
     assert screen.text.splitlines()[-1].startswith("confabulation_votes: 1 of 32 made, 1 asked")
     assert "p95" not in screen.text  # the region is gone
+
+
+def test_lines_that_are_printed_while_the_region_is_drawn_are_all_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(LiveProgress, "beat_s", 0.0005)
+    screen = Screen(80)
+    with terminal(80, 24) as (ours, theirs), os.fdopen(os.dup(theirs), "w") as stream:
+        report = make_progress("auto", stream)
+        for number in range(60):
+            report.stage(f"stage{number}", 1)
+            report.asking("", {f"model{k}": (9, 0) for k in range(number % 5)})
+            report.note(f"{number}: {WORDS}")
+            report.partition("", "", Tally(asked=1))
+            report.end_stage()
+            screen.feed(read_all(ours, wait_s=0.0))
+        report.close()
+        screen.feed(read_all(ours))
+    lines = screen.text.splitlines()
+    assert len(lines) == 3 * 60
+    for number in range(60):
+        assert lines[3 * number].startswith(f"! {number}: ")
+        assert lines[3 * number + 2].startswith(f"stage{number}: 1 of 1 made, 1 asked")

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Form = Literal["auto", "plain", "json"]
-REDRAWS_A_SECOND = 3
 MOST_ROWS = 12  # models and judges in the live region
 _OF_CALLS = 58  # columns of the live table beside the name
 
@@ -27,20 +26,27 @@ _OF_CALLS = 58  # columns of the live table beside the name
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
     """Return the progress that a command installs. form: `auto` is a live region where the stream is a terminal."""
     out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
-    if form == "json":
-        return JsonProgress(out)
     is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
-    return LiveProgress(out) if form == "auto" and is_terminal else PrintedProgress(out)
+    kind = LiveProgress if form == "auto" and is_terminal else PrintedProgress
+    report = JsonProgress(out) if form == "json" else kind(out)
+    report.start()
+    return report
 
 
 class PrintedProgress(Progress):
     """A line for each stage that has asked, rendered or lasted, one for all others together, one every 30 s."""
 
+    beat_s = HEARTBEAT_S
+
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
         self._stream, self._is_gone = stream, False
+        self._printing = threading.RLock()  # a signal's note may come while its own thread prints
         self._tables, self._tables_s = 0, 0.0
         self._closed = threading.Event()
+
+    def start(self) -> None:
+        """Begin to print the state of the stage that runs."""
         threading.Thread(target=self._beat, daemon=True).start()
 
     def end_stage(self) -> None:
@@ -75,7 +81,8 @@ class PrintedProgress(Progress):
     def write(self, line: str) -> None:
         """Print a line, which may hold a provider's words. A stream that is gone ends the run as SIGTERM would."""
         try:
-            self.print_line(plain(line))
+            with self._printing:
+                self.print_line(plain(line))
         except OSError:
             if self._is_gone:
                 return
@@ -87,8 +94,10 @@ class PrintedProgress(Progress):
         print(line, file=self._stream, flush=True)
 
     def _beat(self) -> None:
-        while not self._closed.wait(HEARTBEAT_S):
-            self.beat()
+        while not self._closed.wait(self.beat_s):
+            with self._printing:
+                if not self._closed.is_set():
+                    self.beat()
 
 
 class JsonProgress(PrintedProgress):
@@ -122,6 +131,8 @@ class JsonProgress(PrintedProgress):
 class LiveProgress(PrintedProgress):
     """A region at the bottom of the terminal for the whole run; lines of ended stages and notes scroll above it."""
 
+    beat_s = 0.3
+
     def __init__(self, stream: TextIO) -> None:
         from rich.console import Console
         from rich.live import Live
@@ -131,19 +142,26 @@ class LiveProgress(PrintedProgress):
         self._live = Live(
             console=self._console,
             get_renderable=self._region,
-            refresh_per_second=REDRAWS_A_SECOND,
+            auto_refresh=False,  # rich's own thread and a print of this one would erase each other's lines
             transient=True,
             redirect_stdout=sys.stdout.isatty(),
         )
+
+    def start(self) -> None:
+        """See `PrintedProgress`."""
         self._live.start()
+        super().start()
 
     def close(self) -> None:
         """See `Progress`."""
-        self._live.stop()
+        with self._printing:
+            self._closed.set()
+            self._live.stop()
         super().close()
 
     def beat(self) -> None:
-        """Print nothing: the region shows it."""
+        """Draw the region."""
+        self._live.refresh()
 
     def print_line(self, line: str) -> None:
         """See `PrintedProgress`."""
