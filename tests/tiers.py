@@ -20,7 +20,7 @@ import pytest
 
 DURATIONS = Path(__file__).with_name("durations.json")  # tier to file to CPU seconds, written by the full campaign
 UNKNOWN_S = 5.0  # CPU seconds that a file without a measurement is taken to need
-SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole", "postgres", "s3", "tiny_disk", "small_disk"}
+SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole", "postgres", "s3", "tiny_disk"}
 FAST_S = 5.0  # CPU seconds of a test of `make check`, on the machine on which `LOOP_S` was measured
 LOOP_S = 0.011  # CPU seconds of `_loop` there
 COMPLETE = "TRAPS_TEST_ALL"  # set by `make test` and `make campaign`: only skips that are listed here are accepted

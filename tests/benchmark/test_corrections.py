@@ -121,15 +121,9 @@ DISCARD = {"scenario_id": ID, "action": "discard"}
         ([ADD | {"family": "trebuchet"}], 1),
         ([{k: v for k, v in ADD.items() if k != "params"}], 1),
         ([ADD | {"params": {"mass_kg": 3}}], 1),
-        (
-            [correct(params={"mass_kg": 3})],
-            1,
-        ),
+        ([correct(params={"mass_kg": 3})], 1),
         ([correct()], 1),
-        (
-            [{"scenario_id": ID, "action": "keep", "question": "Q?"}],
-            1,
-        ),
+        ([{"scenario_id": ID, "action": "keep", "question": "Q?"}], 1),
         ([DISCARD | {"answer": "yes"}], 1),
         ([correct(question="Q?", who="")], 1),
         ([correct(question="Q?", when="yesterday")], 1),
@@ -137,10 +131,7 @@ DISCARD = {"scenario_id": ID, "action": "discard"}
         ([correct(qestion="Q?")], 1),
         ([{"scenario_id": ID, "action": "improve"}], 1),
         (["{not json"], 1),
-        (
-            [correct(question="Q?"), "", '{"scenario_id": "a-1", "action": "keep"}'],
-            3,
-        ),
+        ([correct(question="Q?"), "", '{"scenario_id": "a-1", "action": "keep"}'], 3),
     ],
 )
 def test_a_wrong_decision_names_its_file_and_line(

@@ -96,11 +96,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
         def launch() -> None:
             launcher.launch_run(LaunchRunContext(waiting, workspace=None))
 
-        remedied(
-            launch,
-            "cluster.launcher",
-            cluster.start_head,
-        )
+        remedied(launch, "cluster.launcher", cluster.start_head)
         from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMissingImports]
 
         client = JobSubmissionClient(launcher.address)

@@ -153,12 +153,7 @@ def test_errors_and_expiries_are_typed_and_a_partial_batch_leaves_the_rest_missi
 
 
 @pytest.mark.parametrize(
-    "line",
-    [
-        {"custom_id": "other", "response": {"status_code": 200, "body": {}}},
-        {"custom_id": "k"},
-        {"response": {}},
-    ],
+    "line", [{"custom_id": "other", "response": {"status_code": 200, "body": {}}}, {"custom_id": "k"}, {"response": {}}]
 )
 def test_a_line_that_is_not_wanted_or_not_known_is_named_and_nothing_is_imported(
     line: dict[str, Any], tmp_path: Path

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import subprocess
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
+from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, make_checkout
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
@@ -40,44 +38,6 @@ def test_a_damaged_row_of_the_ledger_is_named_and_its_answer_alone_asked_again(s
     assert finished.code == 0, finished.err
     assert f"{path}: row {row}: not what was written: it is not believed; its answer is asked again" in finished.err
     assert finished.counts()["answers"] == 1
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 1 MB."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    mounted = (
-        os.geteuid() == 0
-        and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], check=False).returncode == 0
-    )
-    if not mounted:
-        pytest.skip("mounting a tmpfs needs root")
-    yield folder
-    subprocess.run(["umount", "-l", folder], check=True)
-
-
-def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Checkout, small_disk: Path) -> None:
-    forget_answers(study)
-    ledger = study.workspace / "ledger"
-    ledger.symlink_to(small_disk, target_is_directory=True)
-    filler = small_disk / "filler"
-    filler.write_bytes(b"0" * 500_000)
-    refused = study.score(EXPERIMENT)
-    assert_refused(refused, "ledger.sqlite: cannot be read or written", "no space left", "run the same command again")
-    kept = {row["key"] for row in study.ledger_rows("answers")}
-    assert kept
-    filler.unlink()
-    # Tables made so far are whole; the rest follows with room for it.
-    more = study.workspace.parent / "ledger"
-    subprocess.run(["cp", "-r", f"{small_disk}/.", more], check=True)
-    ledger.unlink()
-    ledger.symlink_to(more, target_is_directory=True)
-    finished = study.score(EXPERIMENT)
-    assert finished.code == 0, finished.err
-    rows = study.ledger_rows("answers")
-    assert len({row["key"] for row in rows}) == len(rows) == 288  # 3 models x 2 regimes x 48 items
-    assert not list(study.workspace.rglob("*.part"))
 
 
 def test_failed_calls_are_told_counted_as_missing_and_asked_again(study: Checkout, tmp_path: Path) -> None:

@@ -83,11 +83,9 @@ class _Echo(BaseHTTPRequestHandler):
         usage = {"prompt_tokens": 9000, "completion_tokens": 5000, "total_tokens": 14000}
         answer = {"id": "x", "object": "chat.completion", "created": 1, "model": echo[:90], "usage": usage}
         error = {"error": {"message": echo, "type": echo, "code": echo[:90]}}
-        status, body = {
-            "refusal": (400, error),
-            "server-error": (500, error),
-            "odd": (200, {"choices": echo}),
-        }.get(request["model"], (200, {**answer, "choices": [choice]}))
+        status, body = {"refusal": (400, error), "server-error": (500, error), "odd": (200, {"choices": echo})}.get(
+            request["model"], (200, {**answer, "choices": [choice]})
+        )
         content = json.dumps(body).encode()
         self.send_response(status)
         self.send_header("content-type", "application/json")

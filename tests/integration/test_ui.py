@@ -48,16 +48,7 @@ def serving(study: Checkout) -> Iterator[str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = (
-        sys.executable,
-        "-m",
-        "traps_pipeline.cli",
-        "ui",
-        "--port",
-        str(port),
-        "--token",
-        TOKEN,
-    )
+    command = (sys.executable, "-m", "traps_pipeline.cli", "ui", "--port", str(port), "--token", TOKEN)
     url, log = f"http://127.0.0.1:{port}", (study.workspace / "dagster-dev.log").open("w")
     # Its runs write to the same stream: a pipe that nobody reads would stop them.
     process = subprocess.Popen(
@@ -282,10 +273,7 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
 def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_it_is_paid(
     study: Checkout, server: str, page: Page
 ) -> None:
-    rows, before = (
-        len(study.ledger_rows("answers")),
-        {n: written(study, n) for n in ("metrics", "report_page")},
-    )
+    rows, before = (len(study.ledger_rows("answers")), {n: written(study, n) for n in ("metrics", "report_page")})
     time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
     study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
     tables = Workspace.open(study.workspace).tables

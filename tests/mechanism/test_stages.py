@@ -34,6 +34,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
     STEERING_VOTES,
 )
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
+from traps_pipeline.mechanism.probing_versions import extraction_version, steering_version
 from traps_pipeline.mechanism.shares import effect_rows, of_paper
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
@@ -51,6 +52,7 @@ from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
+from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.tables import Table
@@ -414,6 +416,15 @@ def test_nulls_and_policies_stand_beside_every_own_direction(steered: Workspace)
     assert set(pecs.query("signs == 'plus'")["source"]) == set(DATASETS)
     label, plus = (pecs.query(f"signs == '{s}' and source == target").reset_index(drop=True) for s in ("label", "plus"))
     assert (label["acc"].dropna() == plus["acc"].dropna()).all()  # controls are the same under both policies
+
+
+def test_a_study_may_show_other_frames_where_it_looks_inside_than_where_it_asks(own: Workspace) -> None:
+    settings, shown = own.mechanism, MediaSpec(profile="frames", uniform=4)
+    models = {"tiny": settings.models["tiny"].model_copy(update={"media": shown})}
+    other = own.allow(mechanism=settings.model_copy(update={"models": models}))
+    assert stages.examined_model(other, "tiny").media == shown != stages.examined_model(own, "tiny").media
+    for version, key in ((extraction_version, STANDARD), (steering_version, "tiny__standard__guided")):
+        assert version(other, key) != version(own, key)  # pyright: ignore[reportArgumentType]
 
 
 def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace) -> None:

@@ -39,8 +39,7 @@ def test_anthropic_counts_area() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "a_frame"),
-    [("gemini-2.5-pro", 258), ("gemini-3.1-pro", 70), ("gpt-5-high", 210), ("gpt-5-mini", 216)],
+    ("name", "a_frame"), [("gemini-2.5-pro", 258), ("gemini-3.1-pro", 70), ("gpt-5-high", 210), ("gpt-5-mini", 216)]
 )
 def test_a_plan_expects_what_the_provider_counts_and_reserves_the_upper_bound(name: str, a_frame: float) -> None:
     entry = get_model(name)

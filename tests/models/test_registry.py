@@ -70,7 +70,7 @@ def test_a_file_without_models_says_what_it_must_hold(tmp_path: Path) -> None:
 
 
 def test_an_unknown_model_is_answered_with_the_known_ones() -> None:
-    with raises(TrapsError, "models.registry.get_model", "gpt-6", "31"):
+    with raises(TrapsError, "models.registry.get_model", "gpt-6", "gpt-5-nr"):
         get_model("gpt-6")
 
 

@@ -15,13 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.people.human_label_rows import HUMAN_LABELS, LABELS_FILE, labels_version
 from traps_pipeline.people.label_units import annotation_protocol, drawn_units, queue_of
-from traps_pipeline.people.labels import (
-    confabulation_rows,
-    human_agreement,
-    label_lines,
-    matrix,
-    truths,
-)
+from traps_pipeline.people.labels import confabulation_rows, human_agreement, label_lines, matrix, truths
 from traps_pipeline.storage.lines import checked_line
 
 PROTOCOL = annotation_protocol()
@@ -89,7 +83,7 @@ def test_agreement_is_over_what_two_people_labelled() -> None:
         ("abstention", "u1", "jd", True), ("abstention", "u1", "ab", True), ("abstention", "u1", "cy", False),
         ("abstention", "u2", "jd", False), ("abstention", "u2", "ab", False),
         ("abstention", "u3", "jd", True),
-        ("correctness", "u9", "jd", True),
+        ("correctness", "u9", "jd", True)
     )  # fmt: skip
     table = human_agreement(given).set_index("task")
     row = table.loc["abstention"]
@@ -113,7 +107,7 @@ def test_agreement_is_over_what_two_people_labelled() -> None:
 def test_most_people_decide_and_a_tie_decides_nothing() -> None:
     given = labels(
         ("abstention", "u1", "jd", True), ("abstention", "u1", "ab", True), ("abstention", "u1", "cy", False),
-        ("abstention", "u2", "jd", False), ("abstention", "u2", "ab", True),
+        ("abstention", "u2", "jd", False), ("abstention", "u2", "ab", True)
     )  # fmt: skip
     assert truths(given, "abstention").set_index("unit")["truth"].to_dict() == {"u1": True, "u2": None}
     with raises(ValueError, "people.labels.truths"):

@@ -112,6 +112,8 @@ def test_the_paper_experiment_holds_the_behavioural_and_the_mechanistic_half() -
         "llava-next-video-7b": 28,
     }
     assert inside.models["gemma-4-e4b"].sweep == (1, 17)  # and 35, which is steered anyway
+    media = inside.models["qwen3-vl-8b"].media
+    assert media is not None and media.uniform == 25  # as its steering was; it answers about 16 frames
     assert (inside.steering.alphas, inside.steering.pairs) == ((2, 5, 10), 50)
     assert (inside.steering.well_posed_pairs, inside.steering.ill_posed_pairs) == (100, 50)
     assert inside.steering.direction_regimes == inside.steering.inference_regimes == ("standard", "guided")

@@ -69,9 +69,9 @@ def test_the_card_says_of_every_seed_whether_the_time_stamps_have_the_effect_tha
     }
     assert {seed for seed, effect in found.items() if abs(effect) <= 0.1} == {2, 3} == found.keys() - {1}
     card = " ".join(CARD.read_text().split())
-    assert "carry -.02 and .03 in seeds 2 and 3" in card and "-.27 in the shipped seed" in card
-    assert "with an interval from -.79 to -.13: not what was wanted" in card
-    assert [round(found[seed], 2) for seed in (1, 2, 3)] == [-0.27, -0.02, 0.03]
+    assert "carry -.02 and .03 in seeds 2 and 3" in card and "-.26 in the shipped seed" in card
+    assert "with an interval from -.63 to .37: undecided" in card
+    assert [round(found[seed], 2) for seed in (1, 2, 3)] == [-0.26, -0.02, 0.03]
 
 
 # --- what was found inside, over seeds --------------------------------------------------------------------------------

@@ -53,14 +53,7 @@ def test_a_look_is_read_back_from_a_record_and_one_that_is_not_there_leaves_none
 
 
 @pytest.mark.parametrize(
-    "look",
-    [
-        {"floor_tones": ["chalk", "gold"]},
-        {"panel": "pink"},
-        {"material": "felt"},
-        {"size": "4k"},
-        {"fog": 1.0},
-    ],
+    "look", [{"floor_tones": ["chalk", "gold"]}, {"panel": "pink"}, {"material": "felt"}, {"size": "4k"}, {"fog": 1.0}]
 )
 def test_a_look_that_does_not_exist_is_refused_by_name(look: dict[str, object]) -> None:
     with raises(ValueError, "scenes.parts.look.Look.from_record"):

@@ -22,9 +22,7 @@ from traps_pipeline.scenes.parts.wording import (
 from traps_pipeline.scenes.physics.kit import Inventory
 
 SCENE = Inventory(
-    colours=("red", "wood", "black"),
-    objects=("ball", "ramp", "line"),
-    things=("red ball", "wooden ramp", "black line"),
+    colours=("red", "wood", "black"), objects=("ball", "ramp", "line"), things=("red ball", "wooden ramp", "black line")
 )
 
 

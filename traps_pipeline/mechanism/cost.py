@@ -65,12 +65,14 @@ class Cost:
 
 
 def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
-    """Return the passes of states, of the untrained network and of patching. scenarios: their number by taxonomy."""
+    """Return the passes of states, sentences, random weights and patching. scenarios: their number by taxonomy."""
     paired = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     beside = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
     beside += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
     beside += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
     work = [Work("states", len(settings.prompts) * paired + beside)]
+    if settings.sentences:  # and the model's own answer, under each regime
+        work.append(Work("sentences", (len(settings.sentences) + 1) * len(settings.prompts) * paired))
     if settings.gate.untrained:
         work.append(Work("states of random weights", paired + beside))
     if settings.patching is not None:

@@ -37,13 +37,13 @@ def states_and_output(results: Results) -> Figure:
 
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
     with figure_style():
-        figure = new_figure(PAGE_IN, 0.6 + 1.9 * len(models))
+        figure = new_figure(PAGE_IN, 0.6 + 2.1 * len(models))
         axes = figure.subplots(len(models), len(datasets), squeeze=False, sharey="row")
         for line, model in zip(axes, models, strict=True):
             for ax, dataset in zip(line, datasets, strict=True):
                 part = rows.loc[(rows["model"] == model) & (rows["dataset"] == dataset)]
                 _scatter(ax, part)
-                figures = ", ".join(f"{name} {area:.2f}" for name, area in orders(part).items())
+                figures = "\n".join(f"{name} {area:.2f}" for name, area in orders(part).items())
                 title = f"{plain(str(model))[:20]}: {SHORT[dataset]}, n {len(part)}\n{figures}"
                 ax.set_title(title + _floor(results, str(model), dataset), size=6)
             line[0].set_ylabel("states: log-odds of void")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 AXES = {"hp": "HP", "ii": "II", "hp_and_ii": "HP and II", "es": "ES", "doubt": "Doubt"}
+GOOD, BAD = "the more the better", "the less the better"  # two colour scales
 HATCHES = ("", "/////", "xxxx", ".....", "-----")
 MOST_MODELS = 12  # columns of a heatmap that stay legible on a page's width
 
@@ -27,7 +29,7 @@ def sub_scenarios(results: Results) -> Figure:
     """AbsRec by sub-scenario (rows, by falling AbsRec under standard) and model (columns), standard beside guided.
 
     Columns are the models that take video, or all others if none of those was asked, 12 at most. The paper prints only
-    means over models, so for its numbers the columns are the figures that it prints.
+    means over models, so for its numbers the columns are the figures that it prints. Blue is good, orange is bad.
     """
     rows = results.sub_scenarios
     rows = rows.loc[rows["abs_rec"].notna()]
@@ -37,18 +39,30 @@ def sub_scenarios(results: Results) -> Figure:
         ["order", "abs_rec", "sub_scenario"], ascending=[True, False, True]
     )
     panels = _by_model(results, rows) or _means(rows)
-    names = [f"{plain(name)}" for name in rows["sub_scenario"]]
+    names = [plain(name).replace("_", " ") for name in rows["sub_scenario"]]
     with figure_style():
         figure = new_figure(PAGE_IN, 1.35 + 0.17 * len(rows))
-        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        wide = [len(panel.columns) for panel in panels]
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=wide)[0]
         first = int((~rows["order"]).sum())
-        images = [_draw_grid(ax, *panel, names, first) for ax, panel in zip(axes, panels, strict=True)]
-        figure.colorbar(images[-1], ax=list(axes), label="%", shrink=0.6, aspect=30, pad=0.01)
+        scales = {panel.scale: _draw_grid(ax, panel, names, first) for ax, panel in zip(axes, panels, strict=True)}
+        for scale, image in scales.items():
+            figure.colorbar(image, ax=list(axes), label=f"{scale}, %", shrink=0.6, aspect=30, pad=0.01)
     return figure
 
 
-def _by_model(results: Results, rows: pd.DataFrame) -> list[tuple[str, list[str], np.ndarray]]:
-    """Title, column names and values (sub-scenarios, models) in percent, under standard and under guided."""
+@dataclass(frozen=True)
+class Panel:
+    """A heatmap: values (sub-scenarios, columns) in percent, on the scale of what is good or of what is bad."""
+
+    title: str
+    columns: list[str]
+    values: np.ndarray
+    scale: str = GOOD
+
+
+def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
+    """The panels of standard and of guided, a column a model."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
     asked = [model for model in load_models() if model in set(cells["model"])]
@@ -60,32 +74,34 @@ def _by_model(results: Results, rows: pd.DataFrame) -> list[tuple[str, list[str]
         if len(part):
             wide = part.pivot(index=["dataset", "scope"], columns="model", values="abs_rec")
             index = list(zip(rows["dataset"], rows["sub_scenario"], strict=True))
-            panels.append(
-                (f"AbsRec, {regime}", models, 100 * wide.reindex(index=index, columns=models).to_numpy(float))
-            )
+            values = 100 * wide.reindex(index=index, columns=models).to_numpy(float)
+            panels.append(Panel(f"AbsRec, {regime}", models, values))
     return panels
 
 
-def _means(rows: pd.DataFrame) -> list[tuple[str, list[str], np.ndarray]]:
-    shown = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "false_abs": "FalseAbs", "acc": "Acc"}
-    return [("means over models", [*shown.values()], 100 * rows[[*shown]].to_numpy(float))]
+def _means(rows: pd.DataFrame) -> list[Panel]:
+    good = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "acc": "Acc"}
+    of = {GOOD: good, BAD: {"false_abs": "FalseAbs"}}
+    titles = {GOOD: "means over models", BAD: ""}
+    return [Panel(titles[s], [*names.values()], 100 * rows[[*names]].to_numpy(float), s) for s, names in of.items()]
 
 
-def _draw_grid(ax: Axes, title: str, columns: list[str], values: np.ndarray, names: list[str], first: int) -> AxesImage:
+def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImage:
     """Draw one panel. A white line separates occlusion (the first rows) from chaotic; a dash means not run."""
-    image = ax.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    columns, values = panel.columns, panel.values
+    image = ax.imshow(values, cmap="Blues" if panel.scale == GOOD else "Oranges", vmin=0, vmax=100, aspect="auto")
     ax.set_facecolor("#f2f4f7")
-    tilt: dict[str, Any] = {"rotation": 45, "ha": "right", "rotation_mode": "anchor"} if len(columns) > 4 else {}
+    tilt: dict[str, Any] = {"rotation": 45, "ha": "right", "rotation_mode": "anchor"}
     ax.set_xticks(range(len(columns)), [plain(name)[:24] for name in columns], **tilt)
     ax.set_yticks(range(len(names)), names)
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
-    ax.set_title(title, size=7.5)
+    ax.set_title(panel.title, size=7.5)
     if 0 < first < len(names):
         ax.axhline(first - 0.5, color="white", linewidth=2)
     for (row, column), value in np.ndenumerate(values):
         missing = np.isnan(value)
-        colour = SOFT if missing else "white" if value < 55 else "black"
+        colour = SOFT if missing else "white" if value > 60 else "black"
         ax.text(column, row, "–" if missing else f"{value:.0f}", ha="center", va="center", size=6, color=colour)
     return image
 

@@ -41,8 +41,8 @@ def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
     """Put every label near its point where it overlaps no marker, no other label and, if possible nearby, no line.
 
-    A leader line connects label and point if they are apart. markers is (n, 2) in data coordinates. The algorithm is
-    greedy and deterministic: the result depends only on the table.
+    A leader line ties a label to its point if they are apart, or several names stand at one point. markers is (n, 2) in
+    data coordinates. The algorithm is greedy and deterministic: the result depends only on the table.
     """
     from matplotlib.patheffects import withStroke
 
@@ -69,7 +69,7 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
         dx, dy = offsets[best]
         note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
         taken = np.vstack([taken, boxes[best]])
-        if distance[best] > 12:
+        if distance[best] > 8 or "\n" in label.text:
             axes.annotate(
                 "", (label.x, label.y), (dx, dy), textcoords="offset points", annotation_clip=False, zorder=1.9,
                 arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": label.colour, "shrinkA": 0, "shrinkB": 2.5},

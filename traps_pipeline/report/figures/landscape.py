@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +46,10 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """J (x) against Acc (y) of every model with iso-PECS contours, one column wide.
 
     points has the columns model, regime, acc, j, pecs, incomplete. A hollow marker is standard, a filled one guided, an
-    arrow connects them, and a dot is json. The dashed line is the frontier under guided, a ring marks each family's
-    best PECS under guided, and ‡ an incomplete model. The reported PECS is averaged per run and dataset, so it can
-    differ slightly from the contours. Models whose named points coincide (reference strategies) share one label.
+    arrow connects them, and a dot is json; thin bars are 95 % intervals of the named point. The dashed line is the
+    frontier under guided, a ring marks each family's best PECS under guided, and ‡ an incomplete model. The reported
+    PECS is averaged per run and dataset, so it can differ slightly from the contours. Models whose named points
+    coincide (reference strategies) share one label.
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
     with figure_style():
@@ -110,10 +112,23 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
         for zorder, (regime, style) in enumerate(styles.items(), start=3):
             if regime in at:
                 axes.scatter(*at[regime], zorder=zorder, clip_on=False, **style)
-        x, y = next(at[r] for r in (GUIDED, *at) if r in at)
+        named = next(regime for regime in (GUIDED, *at) if regime in at)
+        _draw_intervals(axes, rows.loc[rows["regime"] == named].to_dict("records")[0], colour)
+        x, y = at[named]
         mark = f" {INCOMPLETE_MARK}" if bool(rows["incomplete"].fillna(False).astype(bool).any()) else ""
         labels.append(Label(x, y, short(str(model)) + mark, colour))
     return labels
+
+
+def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
+    """Draw the 95 % intervals of J and Acc where the row has them, cut to the values that they can have."""
+    style: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.55, "zorder": 1.8, "clip_on": False}
+    for name, least in (("j", -1.0), ("acc", 0.0)):
+        low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
+        if low is None or high is None or not np.isfinite([low, high]).all():
+            continue
+        ends, other = (max(least, low), min(1.0, high)), row["acc" if name == "j" else "j"]
+        axes.plot(*((ends, (other, other)) if name == "j" else ((other, other), ends)), **style)
 
 
 def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
@@ -139,7 +154,9 @@ def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
     for family, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
         if family != "reference" and best["pecs"] > 0:
-            axes.scatter(best["j"], best["acc"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6)
+            axes.scatter(
+                best["j"], best["acc"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6, clip_on=False
+            )
 
 
 def _draw_key(figure: Figure) -> None:

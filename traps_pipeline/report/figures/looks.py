@@ -49,6 +49,7 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str) -> None:
     low, high = _limits(points.loc[:, "acc"], 0.0, 0.0)
     left, right = _limits(points.loc[:, "j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
     axes.set(xlim=(left, right + 0.03), ylim=(low - 0.03, high + 0.03), xlabel="J = AbsRec − FalseAbs", ylabel=ylabel)
+    axes.locator_params(axis="x", nbins=6)
     axes.axvline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
     edge: dict[str, Any] = {"annotation_clip": False, "va": "center", "color": SOFT, "size": 6}
     labelled = right + 0.05 * (right - left)

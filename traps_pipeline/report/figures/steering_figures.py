@@ -10,11 +10,12 @@ import numpy as np
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
-from traps_pipeline.protocol.datasets import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.report.figures.looks import from_to
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.probe_tables import best_layers
 from traps_pipeline.report.tables.steering_tables import why
+from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 
 if TYPE_CHECKING:
@@ -39,14 +40,14 @@ def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) 
     """Sources by colour and line, targets by marker, below the panels."""
     from matplotlib.lines import Line2D
 
-    sources = [Line2D([], [], color=colours[d], linestyle=LINE[d], label=f"from {SHORT[d]}") for d in DATASETS]
+    sources = [Line2D([], [], color=colours[d], linestyle=LINE[d], label=f"from {TITLES[d].lower()}") for d in DATASETS]
     targets = [
-        Line2D([], [], color=SOFT, linestyle="none", marker=MARKER[d], markersize=3.5, label=f"to {SHORT[d]}")
+        Line2D([], [], color=SOFT, linestyle="none", marker=MARKER[d], markersize=3.5, label=f"to {TITLES[d].lower()}")
         for d in DATASETS
     ]
     handles = [*sources, *targets, *more]
     style: dict[str, Any] = {"columnspacing": 1.0, "handlelength": 2.0, "handletextpad": 0.4}
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(8, -(-len(handles) // 2)), **style)
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, **style)
 
 
 def _key(label: str, face: str) -> Line2D:
@@ -263,7 +264,7 @@ def cosine_heatmaps(results: Results) -> Figure:
 
 
 def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
-    names = [SHORT[name] for name in DATASETS]
+    names = [TITLES[name].replace(", ill", ",\nill") for name in DATASETS]
     found = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
     for (row, one), (column, other) in product(enumerate(DATASETS), repeat=2):
@@ -278,7 +279,7 @@ def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
         texts[row, column] = f"{figure:.2f}{star}".replace("-", "−")
     image = ax.imshow(values, cmap="PuOr", vmin=-COSINE_SCALE, vmax=COSINE_SCALE)
     ax.set_facecolor("#f2f4f7")
-    ax.set_xticks(range(4), names)
+    ax.set_xticks(range(4), names, rotation=90)
     ax.set_yticks(range(4), names)
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)

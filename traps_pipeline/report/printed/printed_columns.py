@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
     """The paper's table `name` of `tables.csv`, which has its title, its place in the paper and its notes."""
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
-    where = f"paper: Tab. {str(about['label']).removeprefix('tab:').removesuffix('#2')}, line {about['line']}"
+    where = f"as the paper prints it, line {about['line']} of its source"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
     return PrintedTable(
         name,
