@@ -102,14 +102,15 @@ def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     ask(report, clock)
     report.beat()
     report.note("slow")
+    report.tell("ok   gpt")
     report.close()
-    begin, progress, note, end = map(json.loads, out.getvalue().splitlines())
+    begin, progress, note, result, end = map(json.loads, out.getvalue().splitlines())
     assert (begin["event"], begin["stage"], begin["done"], begin["partitions"]) == ("begin", "responses", 0, 4)
     assert (progress["event"], progress["spent_usd"], progress["budget_usd"]) == ("progress", 11.0, 50.0)
     assert progress["left_s"] == 40.0
     gpt = {"done": 40, "wanted": 40, "cached": 14, "errors": 1, "retries": 1}
     assert progress["calls"] == {"gpt": gpt | {"per_second": 1.0, "p50_s": 2.1, "p95_s": 3.9, "usd": 10.0}}
-    assert (note["event"], note["text"]) == ("note", "slow")
+    assert (note["event"], note["text"], result["text"]) == ("note", "slow", "ok   gpt")
     assert (end["event"], end["asked"], end["errors"]) == ("end", 20, 1)
 
 

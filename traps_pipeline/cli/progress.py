@@ -73,6 +73,10 @@ class PrintedProgress(Progress):
         """See `Progress`."""
         self.write(f"! {text}")
 
+    def tell(self, text: str) -> None:
+        """Print a result that a person waits for."""
+        self.write(text)
+
     def beat(self) -> None:
         """Print the state of the stage that runs; called every 30 s."""
         if self.current_stage is not None:
@@ -117,6 +121,8 @@ class JsonProgress(PrintedProgress):
     def note(self, text: str) -> None:
         """See `Progress`."""
         self._event("note", {"text": plain(text)})
+
+    tell = note
 
     def beat(self) -> None:
         """See `PrintedProgress`."""

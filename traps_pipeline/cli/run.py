@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.terminal import plain, wrapped
 from traps_pipeline.cli.command import (
     FAILED,
     OK,
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
             workspace,
             experiment,
             until=arguments.until,
-            preflight=None if arguments.no_preflight else shown.write,
+            preflight=None if arguments.no_preflight else shown.tell,
             look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
             open_runs=partial(_open_runs, arguments),
         )
@@ -135,7 +135,9 @@ def run(arguments: argparse.Namespace) -> int:
         return OK
     _print_results(workspace)
     print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
-    print("next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send on")
+    print(
+        wrapped("next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send")
+    )
     return OK
 
 
