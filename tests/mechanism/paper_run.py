@@ -1,8 +1,8 @@
 """The paper's mechanistic experiment on tiny checkpoints of its three families.
 
-The section `mechanism` is that of `assets/experiments/paper.yaml` but for four things: layers are those of a few blocks
-at the same share of the depth, the scenarios are too few for five folds, one pair a cell is steered, and answers are
-short, since a random model never ends one.
+The section `mechanism` is that of `assets/experiments/paper.yaml` but for five things: layers are those of a few blocks
+at the same share of the depth, frames are few and small, the scenarios are too few for five folds, one pair a cell is
+steered, and answers are short, since a random model never ends one.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ def mechanism() -> dict[str, Any]:
     section = paper()["mechanism"]
     for model in DEPTHS:
         layers = section["models"][model]
+        layers.pop("media", None)  # tiny checkpoints are shown what `tiny` says
         for name, layer in layers.items():
             deep = layer if isinstance(layer, list) else [layer]
             found = sorted({shallow(one, model) for one in deep})

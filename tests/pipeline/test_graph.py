@@ -7,6 +7,7 @@ import random
 import dagster as dg
 import pytest
 
+from tests.build.errors import raises
 from tests.tables import TABLES
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.definitions import defs
@@ -94,9 +95,10 @@ def test_what_can_cost_money_is_marked() -> None:
     }
 
 
-def test_an_unknown_stage_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(TrapsError, match=r"no stage 'stages'; choose from scene_specs, videos"):
-        _ = GRAPH["stages"]
+@pytest.mark.parametrize(("name", "known"), [("vidoes", "videos"), ("xyz", "scene_specs, videos")])
+def test_an_unknown_stage_is_answered_with_those_that_it_may_mean(name: str, known: str) -> None:
+    with raises(TrapsError, "pipeline.graph", name, known):
+        _ = GRAPH[name]
 
 
 def test_every_stage_is_made_by_one_job_and_by_the_job_of_everything() -> None:
