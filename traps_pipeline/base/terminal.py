@@ -86,7 +86,8 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
         columns = shutil.get_terminal_size().columns
         while count > 1 and sum(widths[:count]) - 2 > columns:
             count -= 1
-        hidden = f"\nnot shown in {columns} columns: {', '.join(cells[0][count:])}" if count < len(headings) else ""
+        names = ", ".join(cells[0][count:])
+        hidden = "\n" + wrapped(f"not shown in {columns} columns: {names}") if names else ""
     for place, heading in enumerate(cells[0][:count]):
         table.add_column(Text(heading), justify="left" if place in left else "right", no_wrap=True)
     for row in cells[1:]:
