@@ -19,7 +19,7 @@ import pytest
 
 PACKAGE = "traps_pipeline"
 # The graph is declared for the study that the environment names when it is imported: these rooms stand on it.
-OF_ONE_STUDY = ("cli", "cluster", "definitions", "defs", "explorer", "orchestration", "release", "study")
+OF_ONE_STUDY = ("cli", "cluster", "definitions", "exchange", "pipeline", "release", "servers")
 
 
 def traps(arguments: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:

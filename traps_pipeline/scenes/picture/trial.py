@@ -34,7 +34,7 @@ def draw_frame() -> str:
     red = int((frame[..., 0].astype(int) - frame[..., 1] > 60).sum())
     if red < 100:
         raise TrapsError(_unusable(f"a red ball was drawn with {red} red pixels"))
-    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, {version}, one frame drawn ({red} red pixels of the ball)"
+    return f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}, {version}, one frame drawn ({red} red pixels of the ball)"
 
 
 def opengl_variables() -> dict[str, str]:
