@@ -33,6 +33,23 @@ def vote(task: Task, answer: str, ground_truth: str = "left") -> Vote:
     return parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, ITEM | {"ground_truth": ground_truth})
 
 
+def test_a_sentence_that_something_asked_about_is_not_there_rejects_the_premise() -> None:
+    asked = "How many windmills does the peg touch?"
+    for text in (
+        "There is no peg.",
+        "There are no windmills in the video.",
+        '{"reason": "x", "final_answer": "There is no peg"}',
+    ):
+        assert read_statement(text, asked) == Statement(None, rejects=True), text
+    assert read_statement("There is no ball.", asked) is None  # nobody asked about a ball
+    cast = vote("abstention", "There is no ball.")
+    assert (cast.decision, cast.rejects_premise) == (True, True)
+    assert (vote("abstention", "I don't know.").rejects_premise, vote("abstention", "left").rejects_premise) == (
+        False,
+        False,
+    )
+
+
 ABSTAINING = [
     "I don't know.",
     "I don’t know",

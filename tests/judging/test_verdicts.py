@@ -66,6 +66,23 @@ def test_a_controls_two_decisions_are_made_apart(
     assert row["n_valid_correctness"] == 3 - correctness.count("-")
 
 
+def test_a_rejected_premise_is_decided_by_the_majority_and_counted_beside_abstention() -> None:
+    rejecting = {"yyy": True, "yyn": True, "ynn": False, "nnn": False, "yy": True, "yn": None, "y": None, "": None}
+    rows = []
+    for number, (said, rejects) in enumerate(rejecting.items()):
+        votes = vote_rows(["nnn"]).assign(item_id=f"occlusion:s-{number:04d}:void")
+        votes["rejects_premise"] = [word == "y" for word in said] + [None] * (3 - len(said))
+        (row,) = decide(*undone("void", item=number), votes).to_dict("records")
+        assert (None if pd.isna(row["rejects_premise"]) else row["rejects_premise"]) == rejects, said
+        assert row["abstained"] is False
+        rows.append(row)
+    rows[0]["abstained"] = True
+    (cell,) = cell_metrics(pd.DataFrame(rows), {}).to_dict("records")
+    assert (cell["n_rejects"], cell["n_rejects_answered"]) == (3, 2)
+    (cell,) = cell_metrics(pd.DataFrame(rows[5:]), {}).to_dict("records")
+    assert pd.isna(cell["n_rejects"])  # nobody was asked
+
+
 def test_an_answer_that_nobody_judges_has_no_verdict_and_is_not_undecided() -> None:
     items, responses = undone("void", "refused")
     (row,) = decide(items, responses, vote_rows(["yyy"])[:0]).to_dict("records")

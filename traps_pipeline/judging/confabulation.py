@@ -188,7 +188,7 @@ def render(question: str, kind: str, answer: str, trace: str | None) -> str:
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
     """The call to the judge about one failure; it reveals neither model nor regime nor ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
-    return judge_request(judge, SCHEMA, about_answer(TASK, cell, item["item_id"]), user)
+    return judge_request(judge, prompt(f"judge_{TASK}"), SCHEMA, about_answer(TASK, cell, item["item_id"]), user)
 
 
 class Labels(BaseModel):

@@ -25,6 +25,7 @@ class VoteRow(shared.CellRow):
     valid: Valid
     invalid_reason: InvalidReason
     abstained: Annotated[bool | None, "abstention task"]
+    rejects_premise: Annotated[bool | None, "abstention task, of judges with `premise: true`"]
     correct: Annotated[bool | None, "correctness task, decided by code from extracted_value"]
     judge_correct: Annotated[bool | None, "the judge's own claim, recorded and not used"]
     extracted_value: Annotated[str | None, "correctness task"]
@@ -58,6 +59,7 @@ class VerdictRow(shared.CellRow):
     outcome: Annotated[str, "of the response, only an answer being judged; unread where no judge could read it"]
     is_json: Annotated[bool | None, "of the response, in the JSON regime"]
     abstained: Annotated[bool | None, "majority; null if missing or undecided"]
+    rejects_premise: Annotated[bool | None, "majority; null if missing, undecided, or if judges are not asked for it"]
     correct: Annotated[bool | None, "majority on a control; null on a void, and if missing or undecided"]
     n_valid: Annotated[int, "valid abstention votes"]
     n_valid_correctness: Annotated[int, "valid correctness votes (0 on void)"]

@@ -34,7 +34,6 @@ from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.judges import (
-    SCHEMAS,
     JudgeEntry,
     Seat,
     Task,
@@ -42,9 +41,10 @@ from traps_pipeline.models.judges import (
     panel_id,
     require_panel,
     thinking_of,
+    vote_prompt,
+    vote_schema,
 )
 from traps_pipeline.models.participants import Row, when_asked
-from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
@@ -88,13 +88,15 @@ def about_answer(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
     return {"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run}
 
 
-def judge_request(judge: Seat, schema: Mapping[str, Any], about: Mapping[str, str | int], user: str) -> Request:
+def judge_request(
+    judge: Seat, system: str, schema: Mapping[str, Any], about: Mapping[str, str | int], user: str
+) -> Request:
     """The call to a judge for one task about one answer of a cell; the judge returns the schema's JSON."""
     return Request(
         participant=judge.id,
         endpoint=judge.endpoint,
         params={**judge.params, "response_format": schema} if judge.backend == NETWORK else judge.params,
-        system=prompt(f"judge_{about['task']}"),
+        system=system,
         user=user,
         about=about,
     )
@@ -108,7 +110,7 @@ def vote_requests(
         render(task, item["question"], answer, item["ground_truth"]),
         about_answer(task, cell, item["item_id"]),
     )
-    return [judge_request(judge, SCHEMAS[task], about, user) for judge in judges]
+    return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), about, user) for judge in judges]
 
 
 def vote_request(judge: Seat, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
@@ -134,6 +136,7 @@ class AbstentionVote(BaseModel):
     abstained: Flag
     confidence: Confidence
     reasoning: str
+    rejects_premise: Flag | None = None  # of judges that are asked for it
 
 
 class CorrectnessVote(BaseModel):
@@ -149,7 +152,8 @@ class CorrectnessVote(BaseModel):
 class Vote:
     """A judge's vote after validation. decision: abstained, or correct as our code decides it; None if invalid.
 
-    invalid_reason: why a vote decides nothing; UNREAD where the rules know no form of the answer.
+    invalid_reason: why a vote decides nothing; UNREAD where the rules know no form of the answer. rejects_premise: None
+    where the judge was not asked.
     """
 
     valid: bool
@@ -159,6 +163,7 @@ class Vote:
     extracted_value: str | None = None
     confidence: str | None = None
     rationale: str | None = None
+    rejects_premise: bool | None = None
 
 
 Schema = TypeVar("Schema", bound=BaseModel)
@@ -191,7 +196,8 @@ def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | 
     if isinstance(vote, str):
         return Vote(False, invalid_reason=vote)
     if isinstance(vote, AbstentionVote):
-        return Vote(True, vote.abstained, confidence=vote.confidence, rationale=vote.reasoning)
+        told = {"confidence": vote.confidence, "rationale": vote.reasoning, "rejects_premise": vote.rejects_premise}
+        return Vote(True, vote.abstained, **told)
     extracted = None if vote.extracted_value is None else str(vote.extracted_value)
     aliases = json.loads(item["aliases"])
     correct = is_correct(extracted, item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
@@ -337,6 +343,7 @@ def _vote_row(panel: str, cell: Cell, ballot: Ballot, row: Row) -> VoteRow:
         **cell.partition,
         **vote_columns(ballot, vote, row),
         panel=panel,
+        rejects_premise=vote.rejects_premise,
         correct=vote.decision if ballot.task == "correctness" else None,
         judge_correct=vote.judge_correct,
         extracted_value=vote.extracted_value,

@@ -36,6 +36,8 @@ _DECLINES = re.compile(
     f"|(?:{_IT} is )?(?:unanswerable|unknown)"
     "|i do not know this cannot be determined from video"  # the pocket model
 )
+# A sentence that rejects the premise, if the question names the thing: "There is no windmill in the video."
+_ABSENT = re.compile(r"there (?:is|are) no (\w+(?: \w+)?)(?: (?:in|on) (?:this )?(?:video|clip|scene|screen))?")
 _REFERENCE_REASON = "I followed the motion to the end of the clip."  # a label of any family may follow it
 _ANNOUNCED = re.compile(r"(?:(?:the|my) )?(?:(?:correct|final|right) )?answer(?: is ?:?| ?[:=]) ?(.+)", re.IGNORECASE)
 _EXPLAINS = re.compile(
@@ -52,9 +54,11 @@ _QUESTION = re.compile(r"\AQuestion: (.*)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Statement:
-    """What a text states. value: the answer that it commits to; None where it abstains."""
+    """What a text states. value: the answer that it commits to; None where it abstains. rejects: whether it says that
+    something is not there that the question takes for granted."""
 
     value: str | None
+    rejects: bool = False
 
 
 ABSTENTION = Statement(None)
@@ -78,9 +82,11 @@ class RuleJudge:
 def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
     """Return the vote on correctness where the judge is told a ground truth, else the vote on abstention."""
     value = statement.value
-    reason = "The response declines." if value is None else f"The response answers {value!r}."
+    declines = "The response rejects the premise." if statement.rejects else "The response declines."
+    reason = declines if value is None else f"The response answers {value!r}."
     if truth is None:
-        return {"abstained": value is None, "confidence": "high", "reasoning": reason}
+        vote = {"abstained": value is None, "confidence": "high", "reasoning": reason}
+        return vote | {"rejects_premise": statement.rejects}
     correct = value is not None and normalise(value) == normalise(truth)
     return {"correct": correct, "extracted_value": value, "reasoning": reason}
 
@@ -136,6 +142,8 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
         return None
     if _DECLINES.fullmatch(words):
         return ABSTENTION
+    if (absent := _ABSENT.fullmatch(words)) and f" {absent[1]} " in f" {_words(question)} ":
+        return Statement(None, rejects=True)
     is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _offers(question, words)
     return Statement(normalise(text)) if is_choice else None
 

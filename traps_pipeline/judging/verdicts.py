@@ -51,7 +51,7 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
     """VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError where these do not fit."""
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
-    votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "panel"])
+    votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"])
     # Where no answer of the cell is judged, no vote names a panel: what decides nothing is of the study's.
     return decide(items, responses, votes).fillna({"panel": panel_id(workspace.study.panel)})
 
@@ -79,6 +79,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     abstained, correct = majority(abstention), majority(correctness)
     undecided = (abstained == INVALID) | (on_control & (correct == INVALID))
     rows["abstained"], rows["correct"] = decided(abstained), decided(correct)
+    rows["rejects_premise"] = _rejects_premise(rows, votes, len(cast.judges))
     rows["n_valid"] = (abstention != INVALID).sum(axis=1)
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
@@ -88,6 +89,16 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows.loc[times.eq(len(cast.judges)).to_numpy(), "outcome"] = UNREAD
     panels = votes.loc[:, [*CELL, "panel"]].drop_duplicates(CELL)
     return rows.merge(panels, on=CELL, how="left").loc[:, VERDICTS.names]
+
+
+def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> pd.arrays.BooleanArray:
+    """Return the majority on whether each answer rejects the premise, (rows,); null without one, or where nobody was
+    asked."""
+    asked = votes.loc[votes["task"].eq("abstention") & votes["rejects_premise"].notna(), [*ANSWER, "rejects_premise"]]
+    yes = asked.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
+    counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)
+    rejects, accepts = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
+    return pd.arrays.BooleanArray(rejects > n_judges / 2, np.maximum(rejects, accepts) <= n_judges / 2)
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

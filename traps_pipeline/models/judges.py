@@ -33,7 +33,7 @@ from traps_pipeline.models.thinking import Marks
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
 RULE = "rule"  # the backend of the rule judges
-RULES_VERSION = 5  # of judging/rules.py; when it is raised, rule judges vote again
+RULES_VERSION = 6  # of judging/rules.py; when it is raised, rule judges vote again
 RULES_PANEL = "rules"
 ONE_JUDGE = ".1"  # ends the id of a panel of one judge
 BY_RULES = "judged by rules, not comparable"
@@ -41,13 +41,13 @@ Task = Literal["abstention", "correctness"]
 
 
 # What a judge over the network is told to return; what it does return is checked by `judging.panel` all the same.
+_ABSTENTION: Mapping[str, Any] = {
+    "abstained": {"type": "boolean"},
+    "confidence": {"type": "string", "enum": ["high", "medium", "low"]},
+    "reasoning": {"type": "string"},
+}
 SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
-    "abstention": structured(
-        "abstention",
-        abstained={"type": "boolean"},
-        confidence={"type": "string", "enum": ["high", "medium", "low"]},
-        reasoning={"type": "string"},
-    ),
+    "abstention": structured("abstention", **_ABSTENTION),
     "correctness": structured(
         "correctness",
         correct={"type": "boolean"},
@@ -55,6 +55,9 @@ SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
         reasoning={"type": "string"},
     ),
 }
+
+
+_WITH_PREMISE = structured("abstention", **_ABSTENTION, rejects_premise={"type": "boolean"})
 
 
 class Seat(typing.Protocol):
@@ -85,11 +88,28 @@ class Seat(typing.Protocol):
         """The marks of its thinking, which is split off a vote."""
         ...
 
+    @property
+    def premise(self) -> bool:
+        """Whether it also says if an answer rejects the premise of the question."""
+        ...
+
+
+def vote_prompt(seat: Seat, task: Task) -> str:
+    """Return the system prompt of a task: the paper's, with ours about the premise for a judge that is asked for it."""
+    text = prompt(f"judge_{task}")
+    return f"{text}\n\n{prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
+
+
+def vote_schema(seat: Seat, task: Task) -> Mapping[str, Any]:
+    """Return the JSON schema of a judge's vote on a task."""
+    return _WITH_PREMISE if seat.premise and task == "abstention" else SCHEMAS[task]
+
 
 class JudgeEntry(Entry):
     """One judge of `assets/judges.yaml`."""
 
     backend: Literal["rule", "api"]  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
+    premise: bool = False  # whether it also says if an answer rejects the premise of the question; the paper's do not
     limits: Limits = Limits(concurrency=12)
 
     @model_validator(mode="before")
@@ -173,7 +193,10 @@ def panel_version(panel: str) -> str:
 
 def version_of_seats(seats: Iterable[Seat]) -> str:
     """Version of what these judges decide."""
-    judges = [[seat.id, seat.endpoint, dict(seat.params), SCHEMAS, *(seat.thinking or ())] for seat in seats]
+    judges = list[list[Any]]()
+    for seat in seats:
+        more = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []
+        judges.append([seat.id, seat.endpoint, dict(seat.params), SCHEMAS, *(seat.thinking or ()), *more])
     return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
 
 

@@ -207,6 +207,7 @@ def split_rows(content: Content) -> list[SplitRow]:
 def prompt_rows(canary: str) -> list[PromptRow]:
     """A row for the system prompt of each regime, and for each of the panel's tasks."""
     texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
+    texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
     texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}
     return [
         PromptRow(

@@ -60,6 +60,7 @@ class SeatEntry(_Strict):
     endpoint: str = Field(max_length=300)
     params: dict[str, Any]
     thinking: Marks | None = Field(default=None, strict=False)
+    premise: bool = False
 
 
 class About(_Strict):

@@ -63,6 +63,7 @@ OPTIONAL = {
     Column("n_unread", "Unread", "count"): "n_unread",
     Column("broken", "Broken %", "percent"): "broken",
     Column("n_not_json", "Not JSON", "count"): "n_not_json",
+    Column("n_rejects", "Rejects premise", "count"): "n_rejects",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
@@ -98,6 +99,8 @@ LEGEND = {
     "Broken %": "share of items whose text is empty, cut off, unfinished, degenerate or unread",
     "Not JSON": "items of the JSON regime, over all runs, whose text is not the object that the prompt asks for; they "
     "are judged as they stand",
+    "Rejects premise": "void items over all runs whose answer says that something which the question takes for granted "
+    "is not so, in the panel's view; counted apart from abstention, which decides AbsRec",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **ROBUST_TERMS,
@@ -276,7 +279,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         counted = list(by_dataset.values()) if main is None else [main]
         entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
         summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
-        entry |= {n: sum(row[n] for row in counted) for n in (*summed, "n_unread", "n_not_json")}
+        entry |= {n: sum(row[n] for row in counted) for n in (*summed, "n_unread", "n_not_json", "n_rejects")}
         entry["mark"] = _mark(main) if main else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted) else ""

@@ -21,6 +21,7 @@ BOUNDS = ["pecs_low", "pecs_high"]
 BROKEN = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN, "n_errors": ("error", "malformed")}
 COUNTED = [*OUTCOMES, "n_not_json"]
+REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of what not every panel is asked for: null where it is not
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -74,6 +75,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
     groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
     sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNTED]].sum())
+    sums[REJECTS] = groups[REJECTS].sum(min_count=1)
     sums["n_pairs"] = groups["pair_id"].nunique()
     sides = sides_of(datasets[0]) if datasets else ()
     sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
@@ -102,7 +104,10 @@ def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) ->
     complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
     outcomes = {name: verdicts["outcome"].isin(kinds).astype("int64") for name, kinds in OUTCOMES.items()}
     not_json = verdicts["is_json"].eq(False).astype("int64")
-    flags = counts.assign(complete=complete, **outcomes, n_not_json=not_json)
+    rejects = verdicts["rejects_premise"].astype("boolean").where(~on_control)
+    answered = rejects & ~verdicts["abstained"].astype("boolean").fillna(False)
+    rejections = {"n_rejects": rejects.astype("Int64"), "n_rejects_answered": answered.astype("Int64")}
+    flags = counts.assign(complete=complete, **outcomes, n_not_json=not_json, **rejections)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     for prefix, columns in scoped_by.items():

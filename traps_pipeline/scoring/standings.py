@@ -16,6 +16,7 @@ from traps_pipeline.scoring.metrics import (
     CELL,
     COUNTED,
     FIGURES,
+    REJECTS,
     decision_counts,
     joined_epochs,
     mean,
@@ -45,6 +46,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     means, deviations = (groups[FIGURES].agg(f) for f in (mean, _deviation))
     means["pecs_by_family"] = groups["pecs_by_family"].agg(mean)
     bounds, sums = groups[BOUNDS].agg(mean), cast(pd.DataFrame, groups[_SUMMED].sum())
+    sums[REJECTS] = groups[REJECTS].sum(min_count=1)
     board = means.join([deviations.add_suffix("_std"), bounds, sums])
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
@@ -103,6 +105,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     groups = cells.groupby(_RUN, sort=True)
     whole = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
+    counts[REJECTS] = whole[REJECTS].sum(min_count=1)
     overall = whole[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["panel"] = whole["panel"].agg(joined_epochs)
