@@ -261,6 +261,16 @@ def summary(rows: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
+def by_strength(rows: pd.DataFrame, figure: str = "pecs") -> str:
+    """Return the Markdown table of a figure's lowest coverage now, by size and strength."""
+    lines = [f"| {figure}, scenarios | " + " | ".join(STRENGTHS) + " |", "| --- " * (len(STRENGTHS) + 1) + "|"]
+    lowest = rows.loc[rows["figure"] == figure].groupby(["size", "strength"])["coverage_now"].min()
+    for size in dict.fromkeys(rows["size"]):
+        cells = (f"{lowest[size, name]:.0%}" if (size, name) in lowest.index else "" for name in STRENGTHS)
+        lines.append(f"| {size} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -276,7 +286,7 @@ def main() -> None:
         table = pd.concat(pool.map(run, settings, chunksize=6), ignore_index=True)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
-    print(summary(table))
+    print(summary(table), by_strength(table), sep="\n\n")
     worst = table.sort_values("coverage_now").head(8)
     print(
         worst[["size", "strength", "dependence", "figure", "coverage_before", "coverage_now", "width_now"]].to_string()
