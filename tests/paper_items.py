@@ -26,14 +26,20 @@ def items() -> list[dict[str, str]]:
 
 
 def page() -> str:
-    """Return the page: departures with their reasons first, then what is missing, then what is as in the paper."""
+    """Return the page: departures with their reasons, what is missing, and the other items by the file that has them."""
     rows = items()
     counts = Counter(row["status"] for row in rows)
     parts = [f"{HEAD}{len(rows)} items: {', '.join(f'{counts[status]} {status}' for status in STATUSES)}.\n"]
-    for status, title in (("departs", "Departures"), ("missing", "Missing"), ("there", "As in the paper")):
+    for status, title in (("departs", "Departures"), ("missing", "Missing")):
         listed = [_line(row) for row in rows if row["status"] == status]
         parts += [f"\n## {title}\n\n", *listed] if listed else []
-    return "".join(parts)
+    places: dict[str, list[str]] = {}
+    for row in rows:
+        if row["status"] == "there":
+            note = f" ({row['note']})" if row["note"] else ""
+            places.setdefault(row["place"], []).append(f"**{row['n']}** {row['item']}{note}")
+    listed = [f"- `{place}`: {'; '.join(those)}\n" for place, those in places.items()]
+    return "".join([*parts, "\n## As in the paper, by file\n\n", *listed])
 
 
 def _line(row: dict[str, str]) -> str:
