@@ -26,7 +26,7 @@ def items() -> list[dict[str, str]]:
 
 
 def page() -> str:
-    """Return the page: departures with their reasons, what is missing, and the other items by the file that has them."""
+    """Return the page: departures with reasons, what is missing, and the other items by file."""
     rows = items()
     counts = Counter(row["status"] for row in rows)
     parts = [f"{HEAD}{len(rows)} items: {', '.join(f'{counts[status]} {status}' for status in STATUSES)}.\n"]
