@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator
 
 from tests.conftest import ROOT
@@ -15,38 +16,49 @@ from traps_pipeline.cli.command import SHORT, Parser
 PAGE = ROOT / "docs" / "commands.md"
 HEAD = """# Commands
 
-For everyone who types `traps`. After this page you know every command and option. `--help` behind a command shows the
-same; `python -m tests.commands_page` writes this page from the parser.
+For everyone who types `traps`. After this page you know every command and option. `--help` shows the same;
+`python -m tests.commands_page` writes this page from the parser.
 
-Most commands work in a study: `--workspace` names its folder or s3:// address (default: `$TRAPS_WORKSPACE`, else
-`.workspaces/default`). Commands that print data print JSON with `--json`; progress and errors go to standard error.
-[Headless use](ci.md#exit-codes) lists the exit codes. The commands {short}
-need no group: `traps run` is `traps study run`.
-`eval "$(traps completion bash)"` lets a shell complete commands, options and experiments (`zsh` in its place for zsh).
+- Most commands work in a study: `--workspace` names its folder or s3:// address (default: `$TRAPS_WORKSPACE`, else
+  `.workspaces/default`).
+- Results go to standard output, progress and errors to standard error. [Headless use](ci.md#exit-codes) lists the exit
+  codes.
+- {short} need no group: `traps run` is `traps study run`.
+- `eval "$(traps completion bash)"` lets bash complete commands, options and experiments; for zsh write `zsh`.
+
+## Common arguments
+
+They mean this unless a command says otherwise.
+
+{common}
 """
-EVERYWHERE = ("help", "workspace", "json")
+EVERYWHERE = ("help", "workspace")
+COMMANDS_OF_A_COMMON_ARGUMENT = 3
 
 
 def page() -> str:
     """Return the page."""
     parser = build_parser()
+    counts = Counter(row for command in parser.commands.values() for row in _rows(command))
+    common = {row: None for row, count in counts.items() if count >= COMMANDS_OF_A_COMMON_ARGUMENT}
     short = ", ".join(f"`{name}`" for name in SHORT)
-    parts = [HEAD.format(short=short)]
+    parts = [HEAD.format(short=short, common="\n".join(common))]
     for group, text in [*GROUPS.items(), ("", "")]:
         own = {path: each for path, each in parser.commands.items() if path.rpartition(" ")[0] == group}
         parts += [f"## {group.capitalize() or 'Shell'}\n", *([f"To {text}.\n"] if text else [])]
-        parts += [_section(path, each) for path, each in own.items()]
+        parts += [_section(path, each, {*common}) for path, each in own.items()]
     return "\n".join(parts)
 
 
-def _section(path: str, parser: Parser) -> str:
+def _section(path: str, parser: Parser, common: set[str]) -> str:
     (example,) = (line for line in (parser.epilog or "").splitlines() if line.startswith("example: "))
-    has_json = " `--json` prints the result as JSON." if "--json" in parser.options() else ""
     text = f"{parser.description}".rstrip(".")
-    about = f"{text[0].upper()}{text[1:]}.{has_json}"
-    lines = [f"### traps {path}\n", f"{about}\n\nExample: `{example[9:].strip()}`\n"]
     rows = [*_rows(parser)]
-    return "\n".join([*lines, *(["| argument | meaning |", "| --- | --- |", *rows, ""] if rows else [])])
+    shared = ", ".join(row.split("`")[1].split(" ")[0] for row in rows if row in common)
+    also = f" Also takes `{shared.replace(', ', '`, `')}`." if shared else ""
+    lines = [f"### traps {path}\n", f"{text[0].upper()}{text[1:]}.{also} Example: `{example[9:].strip()}`\n"]
+    own = [row for row in rows if row not in common]
+    return "\n".join([*lines, *([*own, ""] if own else [])])
 
 
 def _rows(parser: Parser) -> Iterator[str]:
@@ -62,7 +74,7 @@ def _rows(parser: Parser) -> Iterator[str]:
             part for part in (text, f"one of {choices}" if choices and choices not in text else "") if part
         )
         must = " (required)" if action.required and action.option_strings else ""
-        yield f"| `{name}`{must} | {meaning.replace('|', chr(92) + '|')} |"
+        yield f"- `{name}`{must}: {meaning}"
 
 
 if __name__ == "__main__":

@@ -11,10 +11,10 @@ DATA, PAGE = ROOT / "docs" / "paper.csv", ROOT / "docs" / "paper.md"
 STATUSES = ("there", "departs", "missing")
 HEAD = """# The paper, item by item
 
-For readers of the paper. After this page you know what is implemented, where, and what differs.
+For readers of the paper. After this page you know what differs here, and where each item is implemented.
 
-`docs/paper.csv` is the data: each item also has its line in the paper's LaTeX source and the test that walks it.
-`python -m tests.paper_items` writes this page. A test fails where a named file or test does not exist.
+[paper.csv](paper.csv) lists all items: line in the paper's LaTeX source, file, test, status, note. A test fails where a
+named file or test does not exist. `python -m tests.paper_items` writes this page, which has only the departures.
 
 """
 
@@ -26,11 +26,14 @@ def items() -> list[dict[str, str]]:
 
 
 def page() -> str:
-    """Return the page: departures with their reasons first, then what is missing, then what is as in the paper."""
+    """Return the page: the departures with their reasons, then what is missing."""
     rows = items()
     counts = Counter(row["status"] for row in rows)
-    parts = [f"{HEAD}{len(rows)} items: {', '.join(f'{counts[status]} {status}' for status in STATUSES)}.\n"]
-    for status, title in (("departs", "Departures"), ("missing", "Missing"), ("there", "As in the paper")):
+    summary = "{there} as in the paper, {departs} depart, {missing} are missing".format(
+        **{s: counts[s] for s in STATUSES}
+    )
+    parts = [f"{HEAD}{len(rows)} items: {summary}.\n"]
+    for status, title in (("departs", "Departures"), ("missing", "Missing")):
         listed = [_line(row) for row in rows if row["status"] == status]
         parts += [f"\n## {title}\n\n", *listed] if listed else []
     return "".join(parts)

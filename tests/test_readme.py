@@ -42,7 +42,7 @@ def run(study: Checkout, command: str) -> Finished:
 
 
 # Left to the campaign: these draw, certify, render or train, or repeat what another test of `make test` holds.
-DEAR = re.compile(r"make |sed |traps (benchmark|run|publish harness|models check --live)|TRAPS_SCENE_SPECS|export ")
+DEAR = re.compile(r"make |cp |traps (benchmark|run|publish harness|models check --live)|TRAPS_SCENE_SPECS|export ")
 
 
 @pytest.mark.promise

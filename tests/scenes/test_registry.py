@@ -1,8 +1,7 @@
-"""What the registry refuses, and the family of docs/scenes.md: taken from the page, drawn, certified, observed."""
+"""What the registry refuses, and the family of docs/plank_post.py: drawn, certified, observed."""
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -28,7 +27,7 @@ from traps_pipeline.scenes.parts.independence import dependence
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family
 
-(PAGE,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL | re.MULTILINE)
+EXAMPLE = (ROOT / "docs" / "plank_post.py").read_text()
 
 
 Add = Callable[..., None]
@@ -42,12 +41,12 @@ def forget() -> None:
 
 @pytest.fixture
 def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Add]:
-    """Adds a family file beside the others for one test: the page's, with some of its text replaced."""
+    """Adds a family file beside the others for one test: the example, with some of its text replaced."""
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     added: list[str] = []
 
     def add(name: str, **changes: Sequence[str]) -> None:
-        text = PAGE.replace('"plank_post"', f'"{name}"')
+        text = EXAMPLE.replace('"plank_post"', f'"{name}"')
         for old, new in changes.values():
             assert old in text
             text = text.replace(old, new)
@@ -62,11 +61,11 @@ def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Add]:
     forget()
 
 
-# --- the family of the page -------------------------------------------------------------------------------------------
+# --- the example ----------------------------------------------------------------------------------------------------
 
 
-def test_the_family_of_the_page_is_complete_and_no_part_of_the_benchmark(add: Add) -> None:
-    assert len(PAGE.splitlines()) <= 110
+def test_the_example_is_complete_and_no_part_of_the_benchmark(add: Add) -> None:
+    assert len(EXAMPLE.splitlines()) <= 110
     assert "plank_post" not in load_composition()
     add("plank_post")
     family = registry.fit_to_sample("plank_post")
@@ -75,7 +74,7 @@ def test_the_family_of_the_page_is_complete_and_no_part_of_the_benchmark(add: Ad
 
 
 @pytest.mark.slow
-def test_the_family_of_the_page_is_drawn_certified_rendered_and_observed(add: Add) -> None:
+def test_the_example_is_drawn_certified_rendered_and_observed(add: Add) -> None:
     add("plank_post")
     family = registry.fit_to_sample("plank_post")
     answers: dict[str, Resolved] = {}

@@ -11,7 +11,7 @@ from tests.conftest import ROOT
 from traps_pipeline.scenes.variants.variations import table
 
 PAGE = ROOT / "docs" / "hypotheses.md"
-TABLE = re.compile(r"^\| variation \|.*\n(?:\|.*\n)+|^VARIATIONS\n", re.MULTILINE)
+TABLE = re.compile(r"^\| variation: change \|.*\n(?:\|.*\n)+|^VARIATIONS\n", re.MULTILINE)
 
 
 def written() -> str:

@@ -7,6 +7,7 @@ one. Not every scenario admits every variation; `Rejected` says why.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -257,6 +258,6 @@ VARIATIONS: Mapping[str, Arm] = {
 
 def table() -> str:
     """The variations as the Markdown table of `docs/hypotheses.md`."""
-    lines = ["| variation | changes | certificate |", "| --- | --- | --- |"]
-    lines += [f"| `{one.name}` | {one.takes_away} | {one.promises} |" for one in VARIATIONS.values()]
-    return "\n".join(lines)
+    groups = itertools.groupby(VARIATIONS.values(), key=lambda one: one.promises)
+    rows = [("; ".join(f"`{one.name}`: {one.takes_away}" for one in same), promises) for promises, same in groups]
+    return "\n".join(["| variation: change | certificate |", "| --- | --- |", *(f"| {a} | {b} |" for a, b in rows)])
