@@ -17,9 +17,9 @@ from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.explorer import site
 from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.report.explorer import site
 from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.physics.kit import Box, Physics, View
 from traps_pipeline.scenes.picture.trial import check_rendering

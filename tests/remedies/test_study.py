@@ -16,13 +16,13 @@ from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.checks.canary import canary_items
 from traps_pipeline.exchange import answer_exchange
 from traps_pipeline.exchange.answer_exchange import export_requests
-from traps_pipeline.explorer.answers import study_items
 from traps_pipeline.models.answers import wanted_questions
 from traps_pipeline.pipeline.experiment import Experiment, load_experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
+from traps_pipeline.report.explorer.answers import study_items
 from traps_pipeline.scenes.worlds.clips import read_clip
 from traps_pipeline.servers.annotate import Annotation
 from traps_pipeline.servers.review import Review

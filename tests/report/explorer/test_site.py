@@ -17,13 +17,13 @@ import pytest
 from tests.build.cells import CELL, HOSTILE, row, write_cell
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.explorer import answers
-from traps_pipeline.explorer.answers import NO, NONE, StudyAnswers, study_answers
-from traps_pipeline.explorer.scripts import data_script
-from traps_pipeline.explorer.site import INDEX, SCRIPT, script, write_site
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.report.explorer import answers
+from traps_pipeline.report.explorer.answers import NO, NONE, StudyAnswers, study_answers
+from traps_pipeline.report.explorer.scripts import data_script
+from traps_pipeline.report.explorer.site import INDEX, SCRIPT, script, write_site
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
