@@ -90,7 +90,7 @@ def test_the_sites_libraries_are_used_once_they_are_restored(tmp_path: Path, mon
     kept = site.LIBRARY
     monkeypatch.setattr(site, "LIBRARY", copy)
     copy.write_bytes(copy.read_bytes() + b"//")
-    assert remedied(lambda: site.script.__wrapped__(), "explorer.site.script", lambda: shutil.copy(kept, copy))
+    assert remedied(lambda: site.script.__wrapped__(), "report.explorer.site.script", lambda: shutil.copy(kept, copy))
 
 
 def test_a_ledger_on_a_full_disk_goes_on_once_there_is_space(tiny_disk: Path) -> None:
