@@ -47,10 +47,10 @@ bench-cluster: cluster-setup ## what a cluster costs and gains, against one mach
 	$(BIN)/python bench/cluster.py
 
 explorer-vendor: ## the explorer's libraries, after a version in its package.json was changed; the bundle is checked in
-	cd traps_pipeline/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
+	cd traps_pipeline/report/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
 
 explorer-check: ## types and style of the pages' scripts; needs npm and its index
-	npm exec --yes --ignore-scripts --package=typescript@7.0.2 --package=eslint@10.15.0 -- traps_pipeline/explorer/web/vendor/check.sh
+	npm exec --yes --ignore-scripts --package=typescript@7.0.2 --package=eslint@10.15.0 -- traps_pipeline/report/explorer/web/vendor/check.sh
 
 lock: ## the locks from pyproject.toml, with uv
 	$(PYTHON) tools/lock.py $(LOCK_OPTIONS)

@@ -26,13 +26,13 @@ import pyarrow as pa
 from bench.quick import parse
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs
-from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import CATEGORIES, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts, regime_tests
 from traps_pipeline.scoring.metrics import cell_metrics

@@ -27,7 +27,7 @@ STAGES = {"responses": CELL, "votes": CELL, "verdicts": CELL, "metrics": "chaoti
 SITE = """
 import os
 from pathlib import Path
-from traps_pipeline.explorer.site import site_files
+from traps_pipeline.report.explorer.site import site_files
 from traps_pipeline.storage.workspace import Workspace
 files = site_files(Workspace.open(Path(os.environ["TRAPS_WORKSPACE"])))
 print(f"{len(files)} files, {sum(map(len, files.values())) / 1e6:.0f} MB")

@@ -31,7 +31,6 @@ ROOMS = (
     "inside",
     "checks",
     "report",
-    "explorer",
     "pipeline",
     "exchange",
     "release",

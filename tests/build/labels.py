@@ -7,10 +7,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from tests.judging.conftest import answered_study
-from traps_pipeline.judging.confabulation import AXES, sample_id
+from traps_pipeline.judging.confabulation import sample_id
 from traps_pipeline.judging.judging_rows import CONFABULATION, ConfabulationRow
 from traps_pipeline.people.judge_validation import LABEL_COLUMNS
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.workspace import Workspace
 
 MODEL = "qwen3-vl-think"

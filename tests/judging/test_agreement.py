@@ -23,7 +23,7 @@ from traps_pipeline.judging.agreement import (
     unanimous_share,
 )
 from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS
-from traps_pipeline.judging.ratings import INVALID, NO, YES, majority, ratings
+from traps_pipeline.protocol.ratings import INVALID, NO, YES, majority, ratings
 from traps_pipeline.storage.parquet import TableStore
 
 VALUES = {"y": YES, "n": NO, "-": INVALID}

@@ -18,7 +18,6 @@ from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging import confabulation
 from traps_pipeline.judging.confabulation import (
-    AXES,
     PROTOCOL_FILE,
     VOID_KINDS,
     Labels,
@@ -39,6 +38,7 @@ from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.pipeline.forecast_plan import Plan, make_plan
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.scoring.prevalence import prevalence
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace

@@ -16,7 +16,6 @@ from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
 from tests.judging.conftest import answered_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.people.judge_validation import (
@@ -26,6 +25,7 @@ from traps_pipeline.people.judge_validation import (
     read_labels,
 )
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 
 

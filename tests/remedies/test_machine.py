@@ -17,9 +17,9 @@ from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.explorer import site
 from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.report.explorer import site
 from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.physics.kit import Box, Physics, View
 from traps_pipeline.scenes.picture.trial import check_rendering
@@ -90,7 +90,7 @@ def test_the_sites_libraries_are_used_once_they_are_restored(tmp_path: Path, mon
     kept = site.LIBRARY
     monkeypatch.setattr(site, "LIBRARY", copy)
     copy.write_bytes(copy.read_bytes() + b"//")
-    assert remedied(lambda: site.script.__wrapped__(), "explorer.site.script", lambda: shutil.copy(kept, copy))
+    assert remedied(lambda: site.script.__wrapped__(), "report.explorer.site.script", lambda: shutil.copy(kept, copy))
 
 
 def test_a_ledger_on_a_full_disk_goes_on_once_there_is_space(tiny_disk: Path) -> None:

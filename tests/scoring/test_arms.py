@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from tests.build.verdicts import JUDGES, Rows, of_arm, write
-from traps_pipeline.judging.ratings import VOTE_COLUMNS
 from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures

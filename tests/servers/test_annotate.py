@@ -13,8 +13,8 @@ from tests.build.labels import MODEL, labelled_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import personal_tokens, public_name
 from traps_pipeline.cli import main
-from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.servers.annotate import Annotation, Sent
 from traps_pipeline.servers.server import Listening
 from traps_pipeline.storage.study import Study

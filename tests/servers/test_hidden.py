@@ -10,8 +10,8 @@ import pytest
 
 from tests.foreign_page import CHROMIUM, QUIET
 from traps_pipeline.base.terminal import visible
-from traps_pipeline.explorer.site import WEB
 from traps_pipeline.pipeline.metadata import visible_metadata
+from traps_pipeline.report.explorer.site import WEB
 from traps_pipeline.report.writing import environment
 from traps_pipeline.servers.server import templates
 

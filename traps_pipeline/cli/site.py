@@ -18,7 +18,7 @@ def add(commands: Commands) -> None:
 
 def site(arguments: argparse.Namespace) -> int:
     """See `traps site --help`."""
-    from traps_pipeline.explorer.site import INDEX, write_site
+    from traps_pipeline.report.explorer.site import INDEX, write_site
 
     workspace = open_workspace(arguments)
     folder = (arguments.folder or workspace.root / "site").absolute()

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS
-from traps_pipeline.judging.ratings import INVALID, NO, PANEL, TASKS, YES, Ratings, majority, ratings
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Ratings, majority, ratings
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:

@@ -33,6 +33,7 @@ from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import Made
@@ -40,7 +41,6 @@ from traps_pipeline.storage.workspace import Workspace
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
 TASK = "confabulation"
-AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
 # The parts of a failure's id, to which people's labels refer: another answer is another failure. They are in the
 # protocol's digest, so that the table is made again when the parts change.
 SAMPLED = ("cell", "item", "answer", "trace that the judge sees")

@@ -10,7 +10,12 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.judging.ratings import (
+from traps_pipeline.models.judges import PANEL_SIZES, panel_id
+from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.ratings import (
     ABSTENTION,
     ANSWER,
     CORRECTNESS,
@@ -20,11 +25,6 @@ from traps_pipeline.judging.ratings import (
     majority,
     ratings,
 )
-from traps_pipeline.models.judges import PANEL_SIZES, panel_id
-from traps_pipeline.models.request import JUDGED
-from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace

@@ -14,11 +14,11 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
 from traps_pipeline.mechanism.mechanism_rows import SteeringEffectRow, SteeringShareRow
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.protocol.datasets import taxonomy_of, transfer_type
+from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLES,
     SEED,

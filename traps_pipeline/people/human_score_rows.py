@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.scoring.score_rows import Bootstrap, DatasetOrOverall, Mean
+from traps_pipeline.scoring.score_rows import CI, DatasetOrOverall, Mean
 from traps_pipeline.storage import columns as shared
-from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.tables import Table, with_neighbours
 
 Weighted = Annotated[float | None, "over labels, weighted so that each stratum counts as it does in the study"]
 Corrected = Annotated[float | None, "corrected for the panel's errors, mean over runs; null where undefined"]
@@ -13,6 +13,7 @@ Judged = Annotated[float | None, "as the panel decided, mean over runs"]
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class HumanRow:
     """People on one dataset, or overall (equal-weight mean over the four); no row means that nobody labelled."""
 
@@ -20,21 +21,11 @@ class HumanRow:
     n_people: Annotated[int, "who labelled clips"]
     n_labels: Annotated[int, "labels of clips"]
     n_clips: Annotated[int, "clips labelled, each with its question"]
-    acc: Weighted
-    acc_ci_low: Bootstrap
-    acc_ci_high: Bootstrap
-    abs_rec: Weighted
-    abs_rec_ci_low: Bootstrap
-    abs_rec_ci_high: Bootstrap
-    false_abs: Weighted
-    false_abs_ci_low: Bootstrap
-    false_abs_ci_high: Bootstrap
-    j: Weighted
-    j_ci_low: Bootstrap
-    j_ci_high: Bootstrap
-    pecs: Annotated[float | None, "acc x max(0, j)"]
-    pecs_ci_low: Bootstrap
-    pecs_ci_high: Bootstrap
+    acc: Annotated[Weighted, CI]
+    abs_rec: Annotated[Weighted, CI]
+    false_abs: Annotated[Weighted, CI]
+    j: Annotated[Weighted, CI]
+    pecs: Annotated[float | None, "acc x max(0, j)", CI]
     agreement: Annotated[float | None, "share of pairs of labels of a clip that agree whether it can be known"]
     alpha: Annotated[float | None, "Krippendorff's alpha of whether it can be known"]
     seconds: Annotated[float, "median seconds a clip"]
@@ -45,6 +36,7 @@ HUMAN_ROW = Table("human_row", HumanRow, partition_by=(), key=("dataset",))
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class PanelErrorsRow:
     """The panel against people on one task; no row means that it was not validated."""
 
@@ -53,12 +45,12 @@ class PanelErrorsRow:
     n_tied: Annotated[int, "answers left out, since as many people say yes as no"]
     n_people: Annotated[int, "who labelled"]
     n_yes: Annotated[int, "answers of which people say yes (abstained, correct)"]
-    sensitivity: Annotated[float | None, "share of people's yes that the panel says too, strata weighted; null if none"]
-    sensitivity_ci_low: Bootstrap
-    sensitivity_ci_high: Bootstrap
-    specificity: Annotated[float | None, "share of people's no that the panel says too, strata weighted; null if none"]
-    specificity_ci_low: Bootstrap
-    specificity_ci_high: Bootstrap
+    sensitivity: Annotated[
+        float | None, "share of people's yes that the panel says too, strata weighted; null if none", CI
+    ]
+    specificity: Annotated[
+        float | None, "share of people's no that the panel says too, strata weighted; null if none", CI
+    ]
     undefined: Annotated[str | None, "why figures cannot be corrected for it"]
     panel: shared.Panel
 
@@ -67,6 +59,7 @@ PANEL_ERRORS = Table("panel_errors", PanelErrorsRow, partition_by=(), key=("task
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class CorrectedRow:
     """A model under a regime on one dataset, or overall, as judged and corrected for the panel's errors."""
 
@@ -74,36 +67,16 @@ class CorrectedRow:
     regime: shared.Regime
     dataset: DatasetOrOverall
     n_runs: Annotated[int, "runs averaged"]
-    acc: Judged
-    acc_ci_low: Bootstrap
-    acc_ci_high: Bootstrap
-    acc_corrected: Corrected
-    acc_corrected_ci_low: Bootstrap
-    acc_corrected_ci_high: Bootstrap
-    abs_rec: Judged
-    abs_rec_ci_low: Bootstrap
-    abs_rec_ci_high: Bootstrap
-    abs_rec_corrected: Corrected
-    abs_rec_corrected_ci_low: Bootstrap
-    abs_rec_corrected_ci_high: Bootstrap
-    false_abs: Judged
-    false_abs_ci_low: Bootstrap
-    false_abs_ci_high: Bootstrap
-    false_abs_corrected: Corrected
-    false_abs_corrected_ci_low: Bootstrap
-    false_abs_corrected_ci_high: Bootstrap
-    j: Mean
-    j_ci_low: Bootstrap
-    j_ci_high: Bootstrap
-    j_corrected: Corrected
-    j_corrected_ci_low: Bootstrap
-    j_corrected_ci_high: Bootstrap
-    pecs: Judged
-    pecs_ci_low: Bootstrap
-    pecs_ci_high: Bootstrap
-    pecs_corrected: Corrected
-    pecs_corrected_ci_low: Bootstrap
-    pecs_corrected_ci_high: Bootstrap
+    acc: Annotated[Judged, CI]
+    acc_corrected: Annotated[Corrected, CI]
+    abs_rec: Annotated[Judged, CI]
+    abs_rec_corrected: Annotated[Corrected, CI]
+    false_abs: Annotated[Judged, CI]
+    false_abs_corrected: Annotated[Corrected, CI]
+    j: Annotated[Mean, CI]
+    j_corrected: Annotated[Corrected, CI]
+    pecs: Annotated[Judged, CI]
+    pecs_corrected: Annotated[Corrected, CI]
     panel: shared.Panel
 
 

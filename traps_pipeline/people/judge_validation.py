@@ -21,7 +21,6 @@ from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import (
-    AXES,
     TRACE_AND_OUTPUT,
     VOID_KINDS,
     drawn,
@@ -31,6 +30,7 @@ from traps_pipeline.judging.confabulation import (
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 

@@ -20,12 +20,11 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.judging.agreement import krippendorff_alpha
-from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.judged_answers import is_correct
-from traps_pipeline.judging.ratings import INVALID, NO, YES
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
 from traps_pipeline.people.label_units import ABOUT_ANSWERS, TASKS, TaskName, strata, units
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.ratings import AXES, INVALID, NO, YES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace

@@ -32,8 +32,8 @@ from traps_pipeline.storage.workspace import Workspace
 
 # Stages of these groups take seconds: their code version follows every file of these rooms. Others cost money or take
 # long, and state one that is raised by hand.
-_FOLLOWED = {"report": ("report", "explorer")} | dict.fromkeys(
-    ("scoring", "judging", "people"), ("judging", "scoring", "people")
+_FOLLOWED = {"report": ("protocol", "report")} | dict.fromkeys(
+    ("scoring", "judging", "people"), ("protocol", "judging", "scoring", "people")
 )
 
 

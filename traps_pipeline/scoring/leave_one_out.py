@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
+from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
 from traps_pipeline.scoring.bootstrap import ENTRY
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import LEAVE_ONE_OUT

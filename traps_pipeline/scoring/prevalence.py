@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.judging.confabulation import AXES
+from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.scoring.metrics import joined_epochs, wilson
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE
 

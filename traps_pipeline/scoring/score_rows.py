@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from traps_pipeline.storage import columns as shared
-from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.tables import Beside, Table, with_neighbours
 
 # An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
 # the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
@@ -17,6 +17,12 @@ Deviation = Annotated[float | None, "population standard deviation over runs"]
 Bootstrap = Annotated[
     float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen; null without a figure"
 ]
+# Marks of a figure, which declare the columns beside it.
+STD, CI, WILSON = (
+    Beside(("_std",), Deviation),
+    Beside(("_ci_low", "_ci_high"), Bootstrap),
+    Beside(("_low", "_high"), shared.Wilson),
+)
 Refused = Annotated[str | None, "why the two may not be compared"]
 DatasetOrOverall = Annotated[str, "one of four, or overall"]
 
@@ -127,6 +133,7 @@ REGIME_TESTS = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class LeaderboardRow:
     """A model under a regime on one dataset, or overall (equal-weight mean over the four)."""
 
@@ -150,26 +157,11 @@ class LeaderboardRow:
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
-    acc: Mean
-    acc_std: Deviation
-    abs_rec: Mean
-    abs_rec_std: Deviation
-    false_abs: Mean
-    false_abs_std: Deviation
-    j: Annotated[float | None, "mean over runs, not clipped"]
-    j_std: Deviation
-    pecs: Annotated[float | None, "mean over runs of the per-run PECS"]
-    pecs_std: Deviation
-    acc_ci_low: Bootstrap
-    acc_ci_high: Bootstrap
-    abs_rec_ci_low: Bootstrap
-    abs_rec_ci_high: Bootstrap
-    false_abs_ci_low: Bootstrap
-    false_abs_ci_high: Bootstrap
-    j_ci_low: Bootstrap
-    j_ci_high: Bootstrap
-    pecs_ci_low: Bootstrap
-    pecs_ci_high: Bootstrap
+    acc: Annotated[Mean, STD, CI]
+    abs_rec: Annotated[Mean, STD, CI]
+    false_abs: Annotated[Mean, STD, CI]
+    j: Annotated[float | None, "mean over runs, not clipped", STD, CI]
+    pecs: Annotated[float | None, "mean over runs of the per-run PECS", STD, CI]
     rank: Annotated[
         int | None,
         "by PECS among the models of this regime, dataset and panel; equal values share a rank; null if of two panels",
@@ -195,6 +187,7 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class RobustRow:
     """A model under a regime when clip and question must be read together: the four datasets with the arms asked."""
 
@@ -208,16 +201,14 @@ class RobustRow:
         float | None,
         "share of scenarios with control, twin, void and both crossed questions right, mean over runs; null without "
         "the arms twin_control and crossed",
+        CI,
     ]
-    conjunction_ci_low: Bootstrap
-    conjunction_ci_high: Bootstrap
     n_conjunction: Annotated[int, "scenarios in which that is decided, in the run that has most"]
     robust: Annotated[
         float | None,
         "mean over runs of Acc x max(0, AbsRec - FalseAbs), each a mean over kinds; null without a robust arm",
+        CI,
     ]
-    robust_ci_low: Bootstrap
-    robust_ci_high: Bootstrap
     inference_acc: Annotated[
         float | None, "share of the items of late_panel and predictable_cut answered correctly, mean over runs"
     ]
@@ -232,6 +223,7 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class HypothesisRow:
     """A model under a regime at one dose of a hypothesis (docs/hypotheses.md). No part of PECS or of ROBUST."""
 
@@ -244,25 +236,15 @@ class HypothesisRow:
     n_scenarios: Annotated[int, "scenarios"]
     n_items: Annotated[int, "items per run"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
-    acc: Annotated[float | None, "share of the controls' answers that are right"]
-    acc_ci_low: Bootstrap
-    acc_ci_high: Bootstrap
-    false_abs: Annotated[float | None, "share of controls abstained on; of what is neither, the share abstained on"]
-    false_abs_ci_low: Bootstrap
-    false_abs_ci_high: Bootstrap
-    abs_rec: Annotated[float | None, "share of voids abstained on"]
-    abs_rec_ci_low: Bootstrap
-    abs_rec_ci_high: Bootstrap
-    j: Annotated[float | None, "abs_rec - false_abs"]
-    j_ci_low: Bootstrap
-    j_ci_high: Bootstrap
+    acc: Annotated[float | None, "share of the controls' answers that are right", CI]
+    false_abs: Annotated[float | None, "share of controls abstained on; of what is neither, the share abstained on", CI]
+    abs_rec: Annotated[float | None, "share of voids abstained on", CI]
+    j: Annotated[float | None, "abs_rec - false_abs", CI]
     compared: Annotated[str, "the figure that doses are compared by: j, or abstains, of all items of the dose"]
     value: Annotated[float | None, "that figure"]
     n_compared: Annotated[int | None, "scenarios that the dose and its reference both have; null where refused"]
     at_reference: Annotated[float | None, "that figure at the reference, on the scenarios that both have"]
-    change: Annotated[float | None, "by how much the dose is above it; null where refused"]
-    change_ci_low: Bootstrap
-    change_ci_high: Bootstrap
+    change: Annotated[float | None, "by how much the dose is above it; null where refused", CI]
     chance: Annotated[float | None, "Acc of a guess among the answers that the questions offer"]
     rule: Annotated[str | None, "of the rules with one cue that with the highest value here; null if none was run"]
     rule_value: Annotated[float | None, "its value"]
@@ -308,6 +290,7 @@ LEAVE_ONE_OUT = Table("leave_one_out", LeaveOneOutRow, partition_by=(), key=("mo
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class PrevalenceRow:
     """How often each axis applies to one model's sampled void failures; no row means not run."""
 
@@ -317,21 +300,11 @@ class PrevalenceRow:
     n_failures: Annotated[int, "void failures that the sample was drawn from"]
     n_sampled: Annotated[int, "failures put to the judge"]
     n: Annotated[int, "of these, validly labelled: every share is of n"]
-    hp: Annotated[float | None, "share with a hallucinated premise"]
-    hp_low: shared.Wilson
-    hp_high: shared.Wilson
-    ii: Annotated[float | None, "share with an invalid inference"]
-    ii_low: shared.Wilson
-    ii_high: shared.Wilson
-    hp_and_ii: Annotated[float | None, "share with both"]
-    hp_and_ii_low: shared.Wilson
-    hp_and_ii_high: shared.Wilson
-    es: Annotated[float | None, "share with epistemic surrender"]
-    es_low: shared.Wilson
-    es_high: shared.Wilson
-    doubt: Annotated[float | None, "share with doubt in the reasoning"]
-    doubt_low: shared.Wilson
-    doubt_high: shared.Wilson
+    hp: Annotated[float | None, "share with a hallucinated premise", WILSON]
+    ii: Annotated[float | None, "share with an invalid inference", WILSON]
+    hp_and_ii: Annotated[float | None, "share with both", WILSON]
+    es: Annotated[float | None, "share with epistemic surrender", WILSON]
+    doubt: Annotated[float | None, "share with doubt in the reasoning", WILSON]
     epoch: Annotated[str, "campaigns of the answers and labels, joined by +"]
     benchmark_version: shared.BenchmarkVersion
 

@@ -23,7 +23,7 @@ from fastapi.responses import JSONResponse, Response
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import finalized
 from traps_pipeline.base.webguard import Guard
-from traps_pipeline.explorer.site import WEB as SHARED
+from traps_pipeline.report.explorer.site import WEB as SHARED
 from traps_pipeline.storage.workspace import Workspace
 
 WEB = Path(__file__).parent / "web"

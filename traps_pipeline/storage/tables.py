@@ -11,9 +11,10 @@
     VIDEOS = Table("videos", VideoRow, partition_by=(), key=("scenario_id", "side"))
 
 Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
-keep the order of the fields. Each package declares its tables in a module `tables` or `..._rows`; columns
-that several packages share are in `storage.columns`. The Arrow schema is made from the dataclass, and every file is
-checked against it on writing and on reading.
+keep the order of the fields. Columns that stand beside a figure, such as the bounds of its interval, are declared by a
+mark (`Beside`) of the figure under the decorator `with_neighbours`. Each package declares its tables in a module
+`tables` or `..._rows`; columns that several packages share are in `storage.columns`. The Arrow schema is made from the
+dataclass, and every file is checked against it on writing and on reading.
 """
 
 from __future__ import annotations
@@ -48,6 +49,25 @@ class StoredColumn:
     def type_name(self) -> str:
         """The type as one writes it: str, list[str], datetime."""
         return str(self.type) if get_origin(self.type) else self.type.__name__
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Marks a figure's column: beside it stand columns named after it with these suffixes, of this type and meaning."""
+
+    suffixes: tuple[str, ...]
+    column: Any
+
+
+def with_neighbours(row_type: type[Row]) -> type[Row]:
+    """Declare the columns that stand beside the marked ones (`Beside`); goes below `@dataclass`."""
+    annotations = dict[str, Any]()
+    for name, annotation in row_type.__annotations__.items():
+        annotations[name] = annotation
+        for mark in get_args(annotation)[2:]:
+            annotations |= {f"{name}{suffix}": mark.column for suffix in mark.suffixes}
+    row_type.__annotations__ = annotations
+    return row_type
 
 
 @dataclass(frozen=True)

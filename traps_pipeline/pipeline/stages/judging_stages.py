@@ -52,9 +52,9 @@ def _panel(workspace: Workspace) -> list[str]:
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     """The votes of the study's panel as it is now. Raises TrapsError if there is none."""
-    from traps_pipeline.judging.ratings import VOTE_COLUMNS
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.models.judges import panel_id
+    from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 
     votes = current(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
     votes = votes.loc[votes["panel"] == panel_id(workspace.study.panel)]

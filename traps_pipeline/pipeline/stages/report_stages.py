@@ -56,7 +56,7 @@ def _report_page(workspace: Workspace, _: None) -> Made:
 
 def _site(workspace: Workspace, _: None) -> Made:
     """The explorer: all answers with their votes and clips, on pages that open from disk."""
-    from traps_pipeline.explorer.site import site_files
+    from traps_pipeline.report.explorer.site import site_files
 
     files = site_files(workspace)
     data = workspace.store.below(workspace.reports / "data", "*.js")

@@ -17,13 +17,13 @@ import pytest
 from tests.build.cells import CELL, HOSTILE, row, write_cell
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.explorer import answers
-from traps_pipeline.explorer.answers import NO, NONE, StudyAnswers, study_answers
-from traps_pipeline.explorer.scripts import data_script
-from traps_pipeline.explorer.site import INDEX, SCRIPT, script, write_site
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.report.explorer import answers
+from traps_pipeline.report.explorer.answers import NO, NONE, StudyAnswers, study_answers
+from traps_pipeline.report.explorer.scripts import data_script
+from traps_pipeline.report.explorer.site import INDEX, SCRIPT, script, write_site
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -137,7 +137,7 @@ def test_a_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(workspace:
     foreign = tmp_path / "home"
     foreign.mkdir()
     (foreign / "thesis.tex").write_text("mine")
-    with raises(TrapsError, "explorer.site._former_files"):
+    with raises(TrapsError, "report.explorer.site._former_files"):
         write_site(workspace, foreign)
     assert [path.name for path in foreign.iterdir()] == ["thesis.tex"]
 
@@ -163,7 +163,7 @@ def test_only_clips_of_the_study_are_put_into_the_folder(workspace: Workspace, t
 
 
 def test_a_study_without_items_says_what_to_do(workspace: Workspace, tmp_path: Path) -> None:
-    with raises(TrapsError, "explorer.answers.study_items"):
+    with raises(TrapsError, "report.explorer.answers.study_items"):
         write_site(workspace, tmp_path / "site")
     assert not (tmp_path / "site").exists()
 

@@ -1,4 +1,7 @@
-"""Votes as a matrix with one row per answer and task and one column per judge, for agreement, bias and verdicts."""
+"""Votes of judges as a matrix with one row per answer and task and one column per judge, and their majority.
+
+Verdicts, agreement, bias and scores without one judge are all made from this matrix.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,8 @@ PANEL = "panel"  # stands for all judges together in a column that names a judge
 ANSWER = ["dataset", "model", "regime", "run", "item_id"]
 ABSTENTION, CORRECTNESS = ("void_abstention", "control_abstention"), ("correctness",)
 TASKS = (*ABSTENTION, *CORRECTNESS)
+# What the judges of a confabulation decide about a void failure (docs/spec.md 6.2).
+AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
 VOTE_COLUMNS = [*ANSWER, "side", "task", "judge", "valid", "abstained", "correct", "epoch", "benchmark_version"]
 
 

@@ -6,7 +6,7 @@ tsc -p tsconfig.json
 for page in review annotate; do # each page is a scope of its own
   tsc --ignoreConfig --allowJs --checkJs --noEmit --strict false --target esnext --lib esnext,dom,dom.iterable \
     globals.d.ts ../dom.js ../keys.js ../search.js ../player.js \
-    ../../../servers/web/listening.js "../../../servers/web/$page.js"
+    ../../../../servers/web/listening.js "../../../../servers/web/$page.js"
 done
-cd ../../..
-eslint --config explorer/web/vendor/eslint.config.mjs explorer/web servers/web
+cd ../../../..
+eslint --config report/explorer/web/vendor/eslint.config.mjs report/explorer/web servers/web

@@ -1,10 +1,10 @@
-// Unit tests of the explorer's functions without a page; `node --test` runs them (tests/explorer/test_scripts.py).
+// Unit tests of the explorer's functions without a page; `node --test` runs them (tests/report/explorer/test_scripts.py).
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import test from "node:test";
 import vm from "node:vm";
 
-const WEB = new URL("../../traps_pipeline/explorer/web/", import.meta.url);
+const WEB = new URL("../../../traps_pipeline/report/explorer/web/", import.meta.url);
 const SOURCES = ["numbers.js", "search.js", "download.js", "outcomes.js", "landscape.js", "cases.js"];
 const NAMES = "{ searchTerms, holdsAll, bestPlace, markedParts, csvOf, fraction, mcnemar, casesOf, spreadLabels, countOutcomes, pairOutcomes }";
 const source = SOURCES.map((name) => readFileSync(new URL(name, WEB), "utf8")).join("\n");

@@ -22,13 +22,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.terminal import finalized
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.explorer.answers import StudyAnswers, study_answers
-from traps_pipeline.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.explorer.scripts import data_script, parquet_text
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
 from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.report.explorer.answers import StudyAnswers, study_answers
+from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
+from traps_pipeline.report.explorer.scripts import data_script, parquet_text
 from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import said_by_people
