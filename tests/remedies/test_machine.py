@@ -99,7 +99,7 @@ def test_a_ledger_on_a_full_disk_goes_on_once_there_is_space(tiny_disk: Path) ->
     write(local(tiny_disk), answer("k", "left"))
     filler.write_bytes(b"0" * os.statvfs(tiny_disk).f_bavail * os.statvfs(tiny_disk).f_bsize)
     rows = [answer(f"k{n}", "x" * 300) for n in range(20)]
-    remedied(lambda: write(local(tiny_disk), *rows), "ledger.database.sentence", filler.unlink)
+    remedied(lambda: write(local(tiny_disk), *rows), "ledger.sqlite", filler.unlink)
     assert set(local(tiny_disk).read("m").rows) == {"k", *(row["key"] for row in rows)}
 
 
