@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
@@ -47,8 +47,11 @@ def test_the_report_opens_from_disk_at_each_width(demo: Checkout, browser: Brows
     anchors = page.evaluate("[...document.querySelectorAll('a[href^=\"#\"]')].map(a => a.hash.slice(1))")
     assert len(anchors) > 30 and page.evaluate("ids => ids.filter(id => !document.getElementById(id))", anchors) == []
     assert "Spread over runs: no cell has more than one run." in page.inner_text("#not-run + section")
-    page.locator("a[href='#table-models']").click()  # opens what is collapsed
-    assert page.locator("#table-models tbody tr").first.is_visible()
+    page.goto(page.url + "#table-models")  # opens what is collapsed
+    expect(page.locator("#table-models tbody tr").first).to_be_visible()
+    if width > 1100:  # a narrow page lists chapters alone
+        page.locator("a[href='#table-expanded']").click()
+        expect(page.locator("#table-expanded tbody tr").first).to_be_visible()
     assert problems == []
 
 

@@ -30,6 +30,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 TOKEN = "token-of-the-user-interface"
+NOWHERE = "about:blank"  # while a test waits: a page of Dagster's polls, and draws its graph, for as long as it is open
 RUN_SECONDS = 600  # nine times what a busy machine of two cores takes
 PAUSE_S = 3
 
@@ -94,6 +95,7 @@ def browsing(server: str) -> Iterator[Page]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
         page = patient(browser.new_page(viewport={"width": 1600, "height": 1000}))
         page.goto(f"{server}/?token={TOKEN}")
+        page.goto(NOWHERE)
         expect.set_options(timeout=60_000)
         yield page
         browser.close()
@@ -109,7 +111,7 @@ CELL = "chaotic_ill_posed|prior__json__run1"
 
 
 def launch_all(page: Page, address: str) -> None:
-    """Press "Materialize all" on a page of the graph, choose all partitions, launch."""
+    """Press "Materialize all" on a page of the graph, choose all partitions, launch, and leave the page."""
     page.goto(address)
     page.get_by_role("button", name="Materialize all").first.click()
     page.get_by_role("button", name="All", exact=True).first.click()
@@ -126,6 +128,7 @@ def launch_all(page: Page, address: str) -> None:
     wait_until(chosen, RUN_SECONDS, "all partitions are chosen")
     launch.last.click()
     expect(launch).to_have_count(0)
+    page.goto(NOWHERE)
 
 
 def launch_job(page: Page, server: str, job: str) -> None:

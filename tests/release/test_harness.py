@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.build.harness import ours
-from tests.conftest import EXPERIMENT, Checkout, once
+from tests.conftest import EXPERIMENT, Checkout, forget_rows, once
 from tests.release.environments import run_in
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
@@ -255,7 +255,7 @@ def test_an_inspect_log_is_imported_by_item(
     """Of oracle the log is JSON, of the other inspect's own format."""
     (log,) = (inspected[1] / model).iterdir()
     assert log.suffix == (".json" if model == "oracle" else ".eval")
-    shutil.rmtree(demo_study.workspace / "ledger" / "answers")
+    forget_rows(demo_study, "answers", f"{model}__standard__run1")
     finished = demo_study.traps("study", "import-answers", "demo", log, "--model", model)
     assert finished.code == 0 and finished.out.startswith("128 answers imported, 0 were there already"), finished.err
     given = json.loads(answers.read_text())["standard"][model]
@@ -266,7 +266,7 @@ def test_samples_of_lmms_eval_are_imported_by_item(
     lmms_evaluated: tuple[dict[str, Any], Path], demo_study: Checkout, answers: Path
 ) -> None:
     (samples,) = (lmms_evaluated[1] / "random-50").rglob("*_samples_*.jsonl")
-    shutil.rmtree(demo_study.workspace / "ledger" / "answers")
+    forget_rows(demo_study, "answers", "random-50__standard__run1")
     workspace = Workspace.open(demo_study.workspace)
     found = import_answers(workspace, load_experiment("demo"), samples, Whose("random-50"))
     assert (found.new, found.known) == (128, 0)

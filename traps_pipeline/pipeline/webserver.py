@@ -33,6 +33,7 @@ DANGER = "launch runs, which spend this study's budget"
 STOP_S = 45.0  # for what is told to stop: a run waits 30 s for its calls in flight
 _MODULE = "traps_pipeline.definitions"
 _DRAIN_S, _PAUSE_S = 3, 0.1
+_PATIENCE = {"DAGSTER_GRPC_TIMEOUT_SECONDS": "600"}  # starting a run on a busy machine takes longer than Dagster's 60 s
 SERVED_FOLDERS = ("reports", "site", "clips")
 
 
@@ -59,7 +60,7 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
 
 def _start(module: str, *arguments: str, token: str | None = None) -> int:
     """The process id of a module that is run as a program. token: for its environment."""
-    environment = os.environ | {"DAGSTER_IS_DEV_CLI": "1"} | ({TOKEN_VARIABLE: token} if token else {})
+    environment = _PATIENCE | os.environ | {"DAGSTER_IS_DEV_CLI": "1"} | ({TOKEN_VARIABLE: token} if token else {})
     return subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment).pid
 
 

@@ -1,11 +1,10 @@
-"""The parts of the report page: a card for each table, figure and picture of pairs, the study's beside the paper's."""
+"""The parts of the report page: cards of tables, figures and pictures of pairs, and what the paper has beside them."""
 
 from __future__ import annotations
 
 import json
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -38,12 +37,26 @@ Address = Callable[[Behind], str]
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page. html: escaped, empty if the part was not run; why: then the reason."""
+    """A part of the page.
+
+    Parameters
+    ----------
+    html
+        The study's tables or figures, escaped; empty if the part was not run.
+    why
+        Then the reason.
+    shows
+        What figures show, in words.
+    paper
+        The paper's tables or figures of the kind, escaped.
+    """
 
     name: str
     title: str
     html: str = ""
     why: str = ""
+    shows: str = ""
+    paper: str = ""
 
     @classmethod
     def read(cls, data: bytes) -> Card:
@@ -80,18 +93,29 @@ def explorer_address(behind: Behind) -> str:
 
 
 def table_card(report: TableReport, sources: Sources, address: Address | None = explorer_address) -> Card:
-    """Return the card of a study's tables, with the paper's of the kind."""
-    name, tables = f"table-{report.name}", report.tables(sources.study)
+    """Return the card of a study's tables."""
+    name, tables = _name(report), report.tables(sources.study)
     title = report.title or tables[0].title
     run = [table for table in tables if len(table.rows) or table.none]
     if not run:
         return Card(name, title, why=tables[0].why)
     absent = [f"{table.title}: {table.absence}" for table in tables if table not in run]
+    return Card(name, title, _fragment("tables", own=tables_html(run, title, address), absent=absent, published={}))
+
+
+def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
+    """Return the card whose html is the paper's tables or figure of the kind; empty where it has none."""
+    if isinstance(report, FigureReport):
+        try:
+            pictures = {"The paper’s": _picture(f"{report.name}_published", report.figure(sources.paper))}
+        except NotRun:
+            pictures = {}
+        return Card(_name(report), report.title, _fragment("figures", pictures=pictures, alt=report.title))
     published = {"As the paper prints it": report.as_printed()} if report.paper else {}
     if report.recomputed:
         published["Recomputed from the published tables"] = report.tables(sources.paper)
-    return Card(name, title, _fragment("tables", own=tables_html(run, title, address), absent=absent,
-                published={words: tables_html(each, "", None) for words, each in published.items()}))  # fmt: skip
+    tables = {words: tables_html(each, "", None) for words, each in published.items()}
+    return Card(_name(report), report.title, _fragment("tables", own=[], absent=[], published=tables))
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
@@ -110,18 +134,15 @@ def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | N
 
 
 def figure_card(report: FigureReport, sources: Sources) -> Card:
-    """Return the card of a study's figure, with the paper's."""
-    name = f"figure-{report.name}"
+    """Return the card of a study's figure."""
+    name = _name(report)
     try:
         own = report.figure(sources.study)
     except NotRun as reason:
         return Card(name, report.title, why=str(reason))
     pictures = {"": _picture(report.name, own)}
-    if report.published:
-        with suppress(NotRun):
-            pictures["The paper’s"] = _picture(f"{report.name}_published", report.figure(sources.paper))
     return Card(
-        name, report.title, _fragment("figures", pictures=pictures, alt=report.title, shows=report.note(sources.study))
+        name, report.title, _fragment("figures", pictures=pictures, alt=report.title), shows=report.note(sources.study)
     )
 
 
@@ -132,7 +153,11 @@ def picture_card(name: str, title: str, make: Callable[[], Mapping[str, Figure]]
                     enumerate(make().items())}  # fmt: skip
     except NotRun as reason:
         return Card(name, title, why=str(reason))
-    return Card(name, title, _fragment("figures", pictures=pictures, alt=title, shows=""))
+    return Card(name, title, _fragment("figures", pictures=pictures, alt=title))
+
+
+def _name(report: TableReport | FigureReport) -> str:
+    return f"{'table' if isinstance(report, TableReport) else 'figure'}-{report.name}"
 
 
 def _picture(name: str, figure: Figure, kind: str = "svg") -> Mapping[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from traps_pipeline.report.cards import (
     Sources,
     explorer_address,
     figure_card,
+    paper_card,
     picture_card,
     table_card,
 )
@@ -33,12 +34,13 @@ from traps_pipeline.report.writing import NotRun, environment, figure_files, tab
 from traps_pipeline.storage.workspace import Workspace
 
 PAGE, MARKDOWN, METRICS, INDEX = "report.html", "leaderboard.md", "metrics.jsonl", "index.html"
+PAPER = "paper"  # the chapter of cards that stand beside the study's, and follow from `assets/published` alone
 
 
 @dataclass(frozen=True)
 class Part:
-    """A card of the page before it is made. reads: the stages that it is made from; inputs: instead, the rows that
-    matter, as JSON; null where all rows matter."""
+    """A card before it is made, or what the paper has beside one. reads: the stages that it is made from; inputs:
+    instead, the rows that matter, as JSON; null where all rows matter."""
 
     chapter: str
     name: str
@@ -69,7 +71,13 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
         Part("tables", report.name, lambda report=report: table_card(report, sources, address), report.reads)
         for report in TABLES
     ]
-    return [*figures, *pictures, *tables]
+    paper = [
+        Part(PAPER, f"{kind}-{report.name}", lambda report=report: paper_card(report, sources), ("published",))
+        for kind, reports in (("figure", FIGURES), ("table", TABLES))
+        for report in reports
+        if report.published
+    ]
+    return [*figures, *pictures, *tables, *paper]
 
 
 def report_files(
@@ -77,8 +85,10 @@ def report_files(
 ) -> dict[str, bytes]:
     """Return the report page, the leaderboard as Markdown and as JSON lines, by path. cards: with their chapters."""
     said = said_by_people(study.human_row, study.panel_errors)
+    paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
-        [card for chapter, card in cards if chapter == name] for name in ("figures", "pictures", "tables")
+        [replace(card, paper=paper.get(card.name, "")) for chapter, card in cards if chapter == name]
+        for name in ("figures", "pictures", "tables")
     )
     page = report_html(
         study.board, figures, pictures, tables, findings=study_findings(study), address=address,

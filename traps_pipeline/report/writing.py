@@ -129,7 +129,7 @@ class Column:
         figure = self._number(value)
         spread = self._number(row.get(self.spread)) if self.spread and figure != NONE else NONE
         mark = row.get(self.mark) if self.mark else ""
-        return figure, "" if spread == NONE else spread, mark if isinstance(mark, str) else ""
+        return figure, "" if spread == NONE else spread, plain(mark) if isinstance(mark, str) and mark else ""
 
     def _number(self, value: Any) -> str:
         digits = DIGITS[self.unit] if self.digits is None else self.digits
@@ -260,7 +260,7 @@ def table_latex(table: PrintedTable) -> str:
 
     parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
     caption = latex(". ".join(part.rstrip(".") for part in parts) + ".")
-    cells = [[latex(table.absence)]] if table.absence else [[latex(cell) for cell in row] for row in table.cells]
+    cells = [[latex(table.absence)]] if table.absence else [[_latex(cell) for cell in row] for row in table.cells]
     headings = [""] if table.absence else [latex(column.heading) for column in table.columns]
     frame = pd.DataFrame(cells, columns=pd.RangeIndex(len(headings)))
     styler = frame.style.hide(axis="index").format_index(lambda k: headings[int(k)], axis=1)
@@ -278,8 +278,8 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
     """An HTML fragment: the table in a scrolling box, notes below; escaped. With `address`, every number that has items
     behind it is a link to them."""
 
-    def link(row: Mapping[str, Any], column: Column) -> str | None:
-        shown = column.is_number and column.parts(row)[0] not in ("", NONE)
+    def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
+        shown = column.is_number and figure not in ("", NONE)
         behind = table.trace(row, column.field) if shown and table.trace and address else None
         return address(behind) if behind and address else None
 
@@ -321,7 +321,12 @@ _LATEX = str.maketrans(
 
 def latex(text: object) -> str:
     """The text with all LaTeX special characters escaped; the symbols that our tables use become commands."""
-    return plain(text).translate(_LATEX)
+    return _latex(plain(text))
+
+
+def _latex(cell: str) -> str:
+    """`latex` of a cell as it is printed, which is plain already."""
+    return cell.translate(_LATEX)
 
 
 def _parquet(table: PrintedTable) -> bytes:

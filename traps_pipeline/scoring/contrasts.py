@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
-from math import erfc, inf, sqrt
+from math import comb, erfc, inf, sqrt
 from typing import cast
 
 import numpy as np
@@ -29,7 +29,7 @@ from traps_pipeline.scoring.bootstrap import (
     limits_of,
     resample,
 )
-from traps_pipeline.scoring.epochs import answered, origins_of, refusal
+from traps_pipeline.scoring.epochs import Origin, answered, refusal
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, REGIME_TESTS
 from traps_pipeline.scoring.standings import means_over_runs, standings
@@ -138,36 +138,53 @@ def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
     """REGIME_TESTS rows: McNemar's exact test for every model, dataset, run, decision and pair of regimes."""
-    from scipy.stats import binomtest
-
     rows = []
     for decision, side, column in (
         ("void_abstention", "void", "abstained"),
         ("control_abstention", "control", "abstained"),
         ("correctness", "control", "correct"),
     ):
-        of_side = verdicts.loc[verdicts["side"] == side]
-        for key, group in of_side.groupby(["dataset", "model", "run"], sort=True):
-            dataset, model, run = cast(tuple[str, str, int], key)
-            decisions = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
-            origins = {regime: origins_of(rows) for regime, rows in group.groupby("regime", sort=False)}
+        by_cell = _decisions(verdicts.loc[verdicts["side"] == side], column)
+        for (dataset, model, run), decisions in sorted(by_cell.items()):
             for left, right in combinations([r for r in REGIMES if r in decisions], 2):
-                both = decisions[[left, right]].dropna().astype(bool)
-                on_left, on_right = (both[regime].to_numpy(bool) for regime in (left, right))
-                only_left = np.count_nonzero(on_left & ~on_right)
-                only_right = np.count_nonzero(on_right & ~on_left)
+                sides = decisions[left], decisions[right]
+                both = sides[0].keys() & sides[1].keys()
+                only_left = sum(sides[0][item][0] and not sides[1][item][0] for item in both)
+                only_right = sum(sides[1][item][0] and not sides[0][item][0] for item in both)
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
                 row |= {"left_regime": left, "right_regime": right, "n": len(both)}
                 row |= {"only_left": only_left, "only_right": only_right}
-                of_both = [{item: origins[regime][item] for item in both.index} for regime in (left, right)]
-                row["refused"] = refusal(*of_both)
-                if row["refused"] is None and len(both):
-                    discordant = only_left + only_right
-                    row["p"] = binomtest(only_left, discordant, 0.5).pvalue if discordant else 1.0
+                row["refused"] = refusal(*({item: of[item][1] for item in both} for of in sides))
+                if row["refused"] is None and both:
+                    row["p"] = mcnemar_p(only_left, only_right)
                 rows.append(row)
     table = pd.DataFrame(rows, columns=pd.Index(REGIME_TESTS.names))
     table["p_holm"] = _holm_by(table, ["dataset", "decision", "left_regime", "right_regime"])
     return table
+
+
+def _decisions(
+    verdicts: pd.DataFrame, column: str
+) -> dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]]:
+    """Return the decisions in a column with their origins, by (dataset, model, run), regime and item.
+
+    Undecided items are left out.
+    """
+    decisions: dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]] = {}
+    columns = ["dataset", "model", "run", "regime", "item_id", column, "epoch", "panel"]
+    rows = verdicts[columns].assign(is_decided=verdicts[column].notna()).itertuples(index=False, name=None)
+    for dataset, model, run, regime, item, decision, epoch, panel, is_decided in rows:
+        of_regime = decisions.setdefault((dataset, model, run), {}).setdefault(regime, {})
+        if is_decided:
+            of_regime[item] = bool(decision), Origin(epoch, panel)
+    return decisions
+
+
+def mcnemar_p(only_left: int, only_right: int) -> float:
+    """Return McNemar's exact two-sided p: whether items that differ between two sides differ to either as often."""
+    differing = only_left + only_right
+    tail = sum(comb(differing, k) for k in range(min(only_left, only_right) + 1))
+    return min(1.0, 2 * tail / 2**differing)
 
 
 def holm(p: np.ndarray) -> np.ndarray:

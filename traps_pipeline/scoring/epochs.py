@@ -63,12 +63,6 @@ def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
     return dict(found)
 
 
-def origins_of(verdicts: pd.DataFrame) -> Answered:
-    """The origin of each item of one run."""
-    rows = verdicts[["item_id", "epoch", "panel"]].itertuples(index=False, name=None)
-    return {item: Origin(epoch, panel) for item, epoch, panel in rows}
-
-
 def refusal(left: Answered, right: Answered) -> str | None:
     """Why two sides may not be compared item by item: their items differ, or an item's campaigns or panels do, or
     panels are mixed; else None."""

@@ -1,3 +1,15 @@
+// A link to a collapsed table opens it, also from another page and when it was closed again.
+function unfold(address) {
+  const part = document.getElementById(decodeURIComponent(address.slice(1)));
+  if (part instanceof HTMLDetailsElement) part.open = true;
+}
+document.addEventListener("click", (event) => {
+  const link = event.target.closest("a[href^='#']");
+  if (link) unfold(link.hash);
+});
+window.addEventListener("hashchange", () => unfold(location.hash));
+unfold(location.hash);
+
 // Saves a picture of the page as it is, or drawn as a PNG.
 document.addEventListener("click", (event) => {
   const button = event.target.closest("button[data-save]");
