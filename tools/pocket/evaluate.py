@@ -19,7 +19,7 @@ from traps_pipeline.judging.judged_answers import is_correct
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
-from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.scoring.metrics import wilson
 from traps_pipeline.storage.media import sample
 
@@ -91,7 +91,7 @@ def evaluate(
     entry: ModelEntry,
     asked: Sequence[Asked],
     seed: int,
-    regimes: Sequence[str] = REGIMES,
+    regimes: Sequence[str] = PAPER_REGIMES,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[AnswerCounts]:
     """Ask all questions under every regime; returns the counts by family, regime and kind."""

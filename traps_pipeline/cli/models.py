@@ -13,7 +13,10 @@ def add(commands: Commands) -> None:
     text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
     parser = commands.add("models check", check, text, example="mine.yaml --live", json=True)
     parser.add_argument(
-        "names", nargs="*", metavar="MODEL", help="check only these models and judges, or all of an experiment (a path)"
+        "names",
+        nargs="*",
+        metavar="MODEL",
+        help="check only these models, judges and panels, or all of an experiment (a path)",
     )
     parser.add_argument(
         "--live",
@@ -42,17 +45,22 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _named(arguments: argparse.Namespace) -> list[str]:
-    """The ids of models and judges that are named, those of experiments among them. An own entry of the workspace is
-    known, too."""
-    from traps_pipeline.models.judges import load_panel
+    """Return the ids of models and judges that are named, those of panels and experiments among them.
+
+    An own entry of the workspace is known, too. Raises TrapsError for a panel that cannot vote, named or not.
+    """
+    from traps_pipeline.models.judges import load_panel, load_panels
     from traps_pipeline.pipeline.experiment import load_experiment
     from traps_pipeline.storage.workspace import Workspace
 
     place = place_of(arguments)
     if Workspace.is_there(place):
         entered(Workspace.open(place))
-    names = list[str]()
+    names, panels = list[str](), {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
     for name in arguments.names:
+        if name in panels:
+            names += panels[name]
+            continue
         if not name.endswith((".yaml", ".yml")):
             names.append(name)
             continue

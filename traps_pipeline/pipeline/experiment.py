@@ -17,7 +17,7 @@ from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SCHEMAS
-from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.regimes import PAPER_REGIMES, REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 
 EXPERIMENTS = ASSETS / "experiments"
@@ -37,7 +37,7 @@ class Experiment(BaseModel):
     per_family: int | None = Field(default=None, ge=1)
     datasets: list[str] = list(DATASETS)
     models: list[str] = Field(min_length=1)
-    regimes: list[str] = list(REGIMES)
+    regimes: list[str] = list(PAPER_REGIMES)
     runs: list[Annotated[int, Field(ge=1)]] = Field(default=[1], min_length=1)
     panel: str | None = None
     judged_by_rules: bool | None = Field(default=None, description="let the panel `rules` judge any model")

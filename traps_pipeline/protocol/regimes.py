@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -11,25 +12,27 @@ class Regime:
     """A way of asking. Its texts are files of `assets/prompts`, joined by one blank line.
 
     fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
-    read (docs/spec.md 7.1); none: no states are read under this regime.
+    read (docs/spec.md 7.1); none: no states are read under this regime. marker: of a model's point in the landscape.
     """
 
     name: str
     texts: tuple[str, ...]
     fields: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
+    marker: Literal["hollow", "filled", "dot"] = "dot"
 
 
 # To add a regime, add an entry here and its texts in `assets/prompts`; a name is of lower-case letters.
 BY_NAME: Mapping[str, Regime] = {
     regime.name: regime
     for regime in (
-        Regime("standard", ("standard",), states=("vqa_standard",)),
-        Regime("guided", ("standard", "guided_suffix"), states=("vqa_standard", "vqa_guided_suffix")),
+        Regime("standard", ("standard",), states=("vqa_standard",), marker="hollow"),
+        Regime("guided", ("standard", "guided_suffix"), states=("vqa_standard", "vqa_guided_suffix"), marker="filled"),
         Regime("json", ("standard", "json_suffix"), fields=("reason", "final_answer")),
     )
 }
 REGIMES = tuple(BY_NAME)
+PAPER_REGIMES = ("standard", "guided", "json")  # what the paper asks, and an experiment that names no regimes
 VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)
 # The paper compares answers under these two: the plain prompt, and the one that permits an abstention.
 STANDARD, GUIDED = PROMPTING = ("standard", "guided")

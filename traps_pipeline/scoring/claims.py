@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.protocol.regimes import GUIDED, REGIMES
+from traps_pipeline.protocol.regimes import GUIDED, PAPER_REGIMES
 from traps_pipeline.scoring.analyses import (
     hidden_against_others,
     models_of,
@@ -160,7 +160,7 @@ def _means(cells: dict[tuple[str, str], dict[str, float]]) -> dict[str, dict[str
     """The equal-weight means over datasets by model and regime."""
     models = dict.fromkeys(model for model, _ in cells)
     of = {model: [cell for (name, _), cell in cells.items() if name == model] for model in models}
-    return {model: {regime: fmean(cell[regime] for cell in parts) for regime in REGIMES} for model, parts in of.items()}
+    return {model: {r: fmean(cell[r] for cell in parts) for r in PAPER_REGIMES} for model, parts in of.items()}
 
 
 def _ties() -> Recomputed:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,9 +57,13 @@ def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
 
 
 NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")
-standard_text, guided_text, json_text = (partial(_text, regime=r) for r in ("standard", "guided", "json"))
-standard_messages, guided_messages, json_messages = (
-    partial(_messages, regime=r) for r in ("standard", "guided", "json")
-)
-standard_results, guided_results, json_results = (partial(_results, regime=r) for r in ("standard", "guided", "json"))
+_BY_REGIME = {"text": _text, "messages": _messages, "results": _results}  # a task of a regime names `REGIME_text`
 pecs, acc, abs_rec, false_abs, j, missing, unread = (partial(_figure, name=name) for name in NAMES)
+
+
+def __getattr__(name: str) -> Callable[..., Any]:
+    """Return the function of a regime by the name that a task's YAML has, such as `guided_results`."""
+    regime, _, kind = name.rpartition("_")
+    if not regime or kind not in _BY_REGIME:
+        raise AttributeError(name)
+    return partial(_BY_REGIME[kind], regime=regime)

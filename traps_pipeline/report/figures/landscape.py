@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
+from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merged_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
@@ -105,13 +105,13 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
             axes.plot(*np.array([at[regime] for regime in PROMPTING]).T, color=colour, linewidth=0, zorder=LINES)
             arrow(axes, at[STANDARD], at[GUIDED], colour)
         styles: dict[str, dict[str, Any]] = {
-            "standard": {"s": 20, "marker": marker, "facecolors": "white", "edgecolors": colour, "linewidths": 0.9},
-            "guided": {"s": 20, "marker": marker, "facecolors": colour, "edgecolors": colour, "linewidths": 0.9},
-            "json": {"s": 5, "marker": "o", "facecolors": colour, "edgecolors": "none", "linewidths": 0},
+            "hollow": {"s": 20, "marker": marker, "facecolors": "white", "edgecolors": colour, "linewidths": 0.9},
+            "filled": {"s": 20, "marker": marker, "facecolors": colour, "edgecolors": colour, "linewidths": 0.9},
+            "dot": {"s": 5, "marker": "o", "facecolors": colour, "edgecolors": "none", "linewidths": 0},
         }
-        for zorder, (regime, style) in enumerate(styles.items(), start=3):
+        for zorder, regime in enumerate(REGIMES, start=3):
             if regime in at:
-                axes.scatter(*at[regime], zorder=zorder, clip_on=False, **style)
+                axes.scatter(*at[regime], zorder=zorder, clip_on=False, **styles[BY_NAME[regime].marker])
         named = next(regime for regime in (GUIDED, *at) if regime in at)
         _draw_intervals(axes, rows.loc[rows["regime"] == named].to_dict("records")[0], colour)
         x, y = at[named]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
     COUNTS,
@@ -125,7 +125,7 @@ def expanded(results: Results) -> list[PrintedTable]:
     cells = marked(results.cells)
     tables = []
     for dataset in DATASETS:
-        for regime in REGIMES:
+        for regime in PAPER_REGIMES:
             rows = cells.loc[(cells["dataset"] == dataset) & (cells["regime"] == regime)]
             notes = [epochs(rows), *marks(rows)]
             tables.append(
