@@ -16,7 +16,7 @@ from traps_pipeline.checks.loopback import render
 from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
 from traps_pipeline.checks.wire_check import check_named, examine, requests_of
 from traps_pipeline.cli import main
-from traps_pipeline.models import api
+from traps_pipeline.models import api, judges
 from traps_pipeline.models.registry import JSON_ANSWER, ModelEntry, get_model, load_models
 from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
 
@@ -289,3 +289,16 @@ def test_the_command_fails_where_an_entry_does(
     assert printed[1].startswith("    0 requests were sent")
     assert printed[-1] == "1 entries do not send what they declare"
     assert main(["models", "check", "gpt-6"]) == 1
+
+
+def test_a_panel_is_checked_by_its_name_and_a_broken_one_fails_every_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["models", "check", "rules"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[:-1]] == ["rule-1", "rule-2", "rule-3"]
+    registry = tmp_path / "judges.yaml"
+    registry.write_text(judges.JUDGES_FILE.read_text() + "  two: [judge-gemini-3-flash, judge-claude-opus-4.6]\n")
+    monkeypatch.setattr(judges.load_panels, "__defaults__", (registry,))
+    monkeypatch.setattr(judges.load_panel.__wrapped__, "__defaults__", (registry,))
+    assert main(["models", "check", "rule-1"]) == 1
+    assert "panel 'two' must seat 1 or 3 different known judges" in capsys.readouterr().err
