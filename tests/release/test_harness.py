@@ -297,7 +297,7 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     [
         ([{"item": "x", "regime": "json", "text": "left"}], "x under json, run 1, is not wanted of oracle"),
         ([{"item": "ID", "regime": "json", "text": text} for text in "ab"], "gives another answer"),
-        ([{"item": "ID", "regime": "json", "text": "a", "cost": 3}], "unexpected keyword|Extra inputs"),
+        ([{"item": "ID", "regime": "json", "text": "a", "cost": 3}], "cost: there is no such key"),
         ([{"item": "ID", "regime": "json", "text": "a", "run": [1]}], "gives no item, regime and text"),
         ([{"item": "ID", "regime": "json", "outcome": "error"}], "an error is no answer"),
     ],
