@@ -80,7 +80,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     Cf->Cf at its own and at the best layer, as FIGURES."""
     import pandas as pd
 
-    def by_pair(analysis: str, chosen: pd.Series) -> dict[tuple[str, ...], dict[str, Any]]:
+    def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
         found = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
         return {tuple(row[key] for key in KEYS): row for row in found.to_dict("records")}  # pyright: ignore[reportReturnType]
 
