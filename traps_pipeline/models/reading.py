@@ -25,7 +25,6 @@ from traps_pipeline.models.thinking import (
 )
 
 READING = "4"  # version of this module's rules; the answers' tables are stale when it is raised
-FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)  # what announces the final answer
 # A final answer that is announced as such and ends before the text does: one that is cut off may be another.
 _STATED = re.compile(
     r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*answer[\W_]*?(?:\bis\b\s*:?|[:=])[\s*_\"'`]*"

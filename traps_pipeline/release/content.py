@@ -35,7 +35,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = "clips"
-DATA_LICENCE, PROMPT_LICENCE = "CC-BY-4.0", "CC-BY-NC-4.0"
+PROMPT_LICENCE = "CC-BY-NC-4.0"
 SYSTEM, JUDGE = "system prompt of a model", "prompt of a judge"
 _CLIPS = f"{CLIPS}/"
 

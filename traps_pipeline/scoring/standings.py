@@ -17,7 +17,6 @@ from traps_pipeline.scoring.metrics import (
     COUNTED,
     FIGURES,
     REJECTS,
-    decision_counts,
     joined_epochs,
     mean,
     pecs_of,
@@ -63,25 +62,6 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
     return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean))
-
-
-def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """J of each model over all its decided items pooled, with its binomial standard error: columns model, j,
-    standard_error, n (decided items of both sides).
-
-    The error combines sqrt(p (1 - p) / n) of the two sides; it holds for answers drawn independently, as the random
-    reference strategies draw them, and shows that these are indistinguishable from J = 0 (docs/spec.md 5.3).
-    """
-    counts = cast(pd.DataFrame, decision_counts(verdicts).groupby(verdicts["model"]).sum())
-    on_void, on_control = counts["abs_rec_of"].replace(0, np.nan), counts["false_abs_of"].replace(0, np.nan)
-    abs_rec, false_abs = counts["abs_rec"] / on_void, counts["false_abs"] / on_control
-    variance = abs_rec * (1 - abs_rec) / on_void + false_abs * (1 - false_abs) / on_control
-    pooled = {
-        "j": abs_rec - false_abs,
-        "standard_error": np.sqrt(variance),
-        "n": counts["abs_rec_of"] + counts["false_abs_of"],
-    }
-    return pd.DataFrame(pooled).reset_index()
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
