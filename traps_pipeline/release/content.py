@@ -19,7 +19,7 @@ from traps_pipeline.models.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.release.tables import (
+from traps_pipeline.release.released_rows import (
     CertificateRow,
     HeldOutItemRow,
     PairRow,
