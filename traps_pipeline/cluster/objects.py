@@ -1,8 +1,8 @@
 """A study's files in an object store (S3, Google, Azure), for several hosts.
 
 An object is written once, under the SHA-256 of its content, and never renamed; `object_names.py` says which is current
-under a path. A host keeps what it has fetched in its scratch folder, below `.objects` under the same digests, and links it
-to the paths that people and code know. What is read has the size and the digest of its row.
+under a path. A host keeps what it has fetched in its scratch folder, below `.objects` under the same digests, and links
+it to the paths that people and code know. What is read has the size and the digest of its row.
 """
 
 from __future__ import annotations
