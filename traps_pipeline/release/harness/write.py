@@ -29,7 +29,8 @@ PACKAGE, LMMS = "traps_harness", "lmms"
 _CODE = Path(__file__).parents[2]
 # Modules that are copied under their own names. They import each other and the standard library.
 _COPIED = (
-    *("base/digests.py", "models/request.py", "models/endings.py", "models/thinking.py", "models/reading.py"),
+    *("base/digests.py", "base/redaction.py", "protocol/regimes.py"),
+    *("models/request.py", "models/endings.py", "models/thinking.py", "models/reading.py"),
     *("judging/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
     *("release/harness/harness_items.py", "release/harness/inspect_task.py"),
 )
