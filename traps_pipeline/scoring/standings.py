@@ -18,6 +18,7 @@ from traps_pipeline.scoring.metrics import (
     FIGURES,
     REJECTS,
     joined_epochs,
+    joined_versions,
     mean,
     pecs_of,
 )
@@ -51,7 +52,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["n_pairs"] = groups["n_pairs"].max()
     board["epoch"] = groups["epoch"].agg(joined_epochs)
     board["panel"] = groups["panel"].agg(joined_epochs)
-    board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
+    board["benchmark_version"] = groups["benchmark_version"].agg(joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
     board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
     board["broken"] = board[[*BROKEN]].sum(axis=1) / board["n_items"]
@@ -89,7 +90,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     overall = whole[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["panel"] = whole["panel"].agg(joined_epochs)
-    overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
+    overall["benchmark_version"] = whole["benchmark_version"].agg(joined_versions)
     return overall.reset_index().assign(dataset="overall")
 
 
@@ -122,11 +123,6 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     }
     ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
     return pd.DataFrame(ranks).where(ranked).astype("Int64")
-
-
-def _joined_versions(versions: pd.Series) -> str:
-    """The distinct versions, sorted and joined by ` + `."""
-    return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
