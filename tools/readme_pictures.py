@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from traps_pipeline.report.contact_sheet import contact_sheet
+from traps_pipeline.report.contact_sheet import Layout, pairs_figure
 from traps_pipeline.report.figures.looks import family_colour, family_of
 from traps_pipeline.report.writing import INK, SOFT, figure_bytes, figure_style, new_figure
 from traps_pipeline.scoring.published import published_overall
@@ -26,6 +26,7 @@ from traps_pipeline.video.encode import decode
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCENARIO, SHOWN_S = "hidden_drop-0001", 3.1  # then a panel closes the control
+SHEET = Layout(6.4, 0.95, 0.5, letters=108, questions=2, ids=True, moments=4, columns=2, dpi=150, size=8)
 ON_SHEET = ("tumbling_dice-0006", "domino_chain-0005")
 HOLD_MS = 2600  # the last frame, with the answers
 WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 100, 62, 8  # px: a clip, the texts above and below it, between the clips
@@ -108,7 +109,7 @@ def main() -> None:
     if len(moving) > MOST_BYTES:
         raise SystemExit(f"docs/moving_pair.gif has {len(moving)} bytes, more than {MOST_BYTES}; shorten SHOWN_S")
     items = workspace.tables.read_all(ITEMS).query("scenario_id in @ON_SHEET and dataset in ('chaotic', 'occlusion')")
-    (DOCS / "two_pairs.png").write_bytes(contact_sheet(items, workspace.root))
+    (DOCS / "two_pairs.png").write_bytes(figure_bytes(pairs_figure(items, workspace.root, SHEET)))
     (DOCS / "finding.png").write_bytes(finding())
     print(f"docs/moving_pair.gif: {len(moving)} bytes; docs/two_pairs.png, docs/finding.png")
 

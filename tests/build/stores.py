@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.cluster.database import Database
+from traps_pipeline.cluster.cluster_database import Database
 from traps_pipeline.cluster.objects import Bucket, ObjectStore
 from traps_pipeline.storage.store import FolderStore, Store
 

@@ -17,7 +17,8 @@ from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
 from traps_pipeline.checks.wire_check import check_named, examine, requests_of
 from traps_pipeline.cli import main
 from traps_pipeline.models import api, judges
-from traps_pipeline.models.registry import JSON_ANSWER, ModelEntry, get_model, load_models
+from traps_pipeline.models.registry import ModelEntry, answer_object, get_model, load_models
+from traps_pipeline.protocol.regimes import FIELDS
 from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
 
 pytestmark = pytest.mark.slow  # litellm's import
@@ -208,7 +209,7 @@ def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPa
             id="a key in the body",
         ),
         pytest.param(
-            altered("qwen3-vl-think", {"response_format": JSON_ANSWER}),
+            altered("qwen3-vl-think", {"response_format": answer_object(FIELDS["json"])}),
             "standard: structured output is for the JSON regime alone",
             id="a schema in every regime",
         ),

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.cli import build_parser, main
-from traps_pipeline.cli.run import _print_problems
+from traps_pipeline.cli.run_commands import _print_problems
 
 SAMPLE = ["benchmark", "sample", "--seed", "1", "--out", "x"]
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.terminals import Screen, read_all, terminal
 from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally
-from traps_pipeline.cli.progress import LiveProgress, make_progress
+from traps_pipeline.cli.printed_progress import LiveProgress, make_progress
 
 WORDS = "a provider's words that are longer than the eighty columns of a terminal, so that they stand on two lines"
 

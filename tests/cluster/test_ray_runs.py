@@ -22,12 +22,12 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.videos import CLIPS
-from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml, export
 from traps_pipeline.cluster.ray_runs import RayRuns
 from traps_pipeline.cluster.requests import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.cluster.same_code import code_here, installed, require_same_code
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.cluster.shared_history import HISTORY, LOGS, dagster_yaml, export
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.runs import broke_off, range_tags

@@ -15,7 +15,7 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.cluster import objects
 from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.database import Database
+from traps_pipeline.cluster.cluster_database import Database
 from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, Workspace

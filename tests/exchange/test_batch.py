@@ -19,8 +19,8 @@ from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.checks import loopback
 from traps_pipeline.checks.live_check import requests_of
-from traps_pipeline.exchange import batch
-from traps_pipeline.exchange.batch import export_batches, failures, is_batch, outcomes_of, read_batch
+from traps_pipeline.exchange import provider_batch
+from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.models import api
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.judges import JudgeEntry
@@ -160,7 +160,7 @@ def test_a_line_that_is_not_wanted_or_not_known_is_named_and_nothing_is_imported
 ) -> None:
     path = tmp_path / "results.jsonl"
     path.write_text(json.dumps(line) + "\n")
-    with raises(TrapsError, "exchange.batch.read_batch", "results.jsonl:1"):
+    with raises(TrapsError, "exchange.provider_batch.read_batch", "results.jsonl:1"):
         read_batch(path, {"k": Request("m", "openai/m", {}, "", "", {})})
 
 
@@ -211,18 +211,18 @@ def test_failures_of_every_form_are_outcomes_of_their_kind(
 
 
 def test_files_are_split_by_number_and_by_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "LIMITS", {"chat": (3, 10_000), "anthropic": (2, 10_000)})
-    part = batch._Part(tmp_path, "m")
+    monkeypatch.setattr(provider_batch, "LIMITS", {"chat": (3, 10_000), "anthropic": (2, 10_000)})
+    part = provider_batch._Part(tmp_path, "m")
     for k in range(7):
         part.add("chat", {"custom_id": str(k), "body": {}})
     assert [len(file.read_text().splitlines()) for file in part.written()] == [3, 3, 1]
-    monkeypatch.setattr(batch, "LIMITS", {"chat": (100, 250)})
-    part = batch._Part(tmp_path, "n")
+    monkeypatch.setattr(provider_batch, "LIMITS", {"chat": (100, 250)})
+    part = provider_batch._Part(tmp_path, "n")
     for k in range(4):
         part.add("chat", {"custom_id": str(k), "body": "x" * 100})
     assert [len(file.read_text().splitlines()) for file in part.written()] == [1, 1, 1, 1]
-    monkeypatch.setattr(batch, "LIMITS", {"anthropic": (2, 10_000)})
-    part = batch._Part(tmp_path, "o")
+    monkeypatch.setattr(provider_batch, "LIMITS", {"anthropic": (2, 10_000)})
+    part = provider_batch._Part(tmp_path, "o")
     for k in range(3):
         part.add("anthropic", {"custom_id": str(k), "params": {}})
     first, second = (json.loads(file.read_text())["requests"] for file in part.written())

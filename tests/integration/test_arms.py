@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import Checkout
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
 from traps_pipeline.scoring.score_rows import HYPOTHESES, LEADERBOARD, ROBUST
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from tests.build.pooled import pooled_j
 from tests.conftest import Checkout
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, VERDICTS
 from traps_pipeline.scoring.score_rows import LEADERBOARD, LEAVE_ONE_OUT, METRICS
-from traps_pipeline.scoring.standings import pooled_j
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 

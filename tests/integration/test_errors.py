@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, make_checkout
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 

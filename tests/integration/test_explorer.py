@@ -23,7 +23,7 @@ from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
 from tests.pages import patient, until
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.report.leaderboard_page import leaderboards
 from traps_pipeline.report.published_results import PublishedResults

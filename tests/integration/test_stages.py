@@ -15,7 +15,7 @@ import yaml
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers, forget_rows
 from traps_pipeline.judging import panel
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS

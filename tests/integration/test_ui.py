@@ -22,7 +22,7 @@ from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.foreign_page import CHROMIUM, QUIET, attack
 from tests.pages import patient
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.automation import INTERVAL_S
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table

@@ -11,9 +11,9 @@ from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.panel import Vote, parse_vote, render
 from traps_pipeline.judging.rules import ABSTENTION, RuleJudge, Statement, read_statement
 from traps_pipeline.models.judges import Task
-from traps_pipeline.models.prompts import FIELDS
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.regimes import FIELDS
 
 QUESTION = "Where did the ball end up -- left bin, right bin, or somewhere else?"
 BINS = "Does the ball end up in the left bin (red) or the right bin (blue)?"

@@ -13,7 +13,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.money import Money, Releasable
-from traps_pipeline.ledger.transfer import copy_ledger, export_ledger, import_ledger
+from traps_pipeline.ledger.row_transfer import copy_ledger, export_ledger, import_ledger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

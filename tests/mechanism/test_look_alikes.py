@@ -34,11 +34,11 @@ from traps_pipeline.mechanism.sentences import sentence_rows
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.mechanism.untrained import untrained_states
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.benchmark_tables import ITEMS

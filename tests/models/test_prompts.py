@@ -6,7 +6,8 @@ import re
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.prompts import FIELDS, PROMPTS, prompt, prompt_version, system_prompt
+from traps_pipeline.models.prompts import PROMPTS, prompt, prompt_version, system_prompt
+from traps_pipeline.protocol.regimes import FIELDS
 
 
 def raw(name: str) -> str:

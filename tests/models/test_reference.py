@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.models.prompts import FIELDS
 from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, uniform
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.protocol.regimes import FIELDS
 
 LABELS = ["left", "right", "elsewhere"]
 

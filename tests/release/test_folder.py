@@ -21,7 +21,7 @@ from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
 from traps_pipeline.release.folder import Options, identifying, write_release
-from traps_pipeline.release.tables import OPEN
+from traps_pipeline.release.released_rows import OPEN
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import decode

@@ -17,8 +17,8 @@ from tests.release.environments import run_in
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.answer_exchange import Whose, import_answers
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
 from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
@@ -98,7 +98,8 @@ def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
 
 
 def test_its_code_is_the_pipelines_own_and_needs_nothing_of_it(harness: Path) -> None:
-    for path in (harness / "traps_harness").glob("*.py"):
+    paths = [*(harness / "traps_harness").glob("*.py")]
+    for path in paths:
         names = [
             name
             for node in ast.walk(ast.parse(path.read_text()))
@@ -106,6 +107,8 @@ def test_its_code_is_the_pipelines_own_and_needs_nothing_of_it(harness: Path) ->
             for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names])
         ]
         assert [name for name in names if name.startswith("traps_pipeline")] == []
+        neighbours = [name.partition(".")[2] for name in names if name.startswith("traps_harness.")]
+        assert {*neighbours} <= {each.stem for each in paths}
         allowed = {*sys.stdlib_module_names, "traps_harness", "inspect_ai"}
         assert [name for name in names if name.partition(".")[0] not in allowed] == []
     assert copied("from traps_pipeline.judging.rules import x\n") == "from traps_harness.rules import x\n"
@@ -132,7 +135,7 @@ from inspect_ai.model import ModelOutput, ModelUsage, get_model
 folder, answers, logs, regime, *models = sys.argv[1:]
 sys.path.insert(0, folder)
 from traps_task import traps
-from traps_harness.items import items
+from traps_harness.harness_items import items
 given, found = json.load(open(answers))[regime], {"version": version("inspect_ai")}
 for model in models:
     outputs = [ModelOutput.from_content("mockllm/model", given[model][item["item_id"]]) for item in items()]

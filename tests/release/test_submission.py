@@ -18,9 +18,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
+from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import ABOUT, TABLES, _zipped, pack, read_submission, table_bytes
 from traps_pipeline.release.submissions import gather, write_board
-from traps_pipeline.release.tables import SUBMITTED
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.scoring.scored import score

@@ -21,9 +21,9 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.history import HISTORY, LOGS
 from traps_pipeline.cluster.ray_runs import require_cluster
 from traps_pipeline.cluster.same_code import code_here, require_same_code
+from traps_pipeline.cluster.shared_history import HISTORY, LOGS
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.spending import spending
 from traps_pipeline.pipeline.run import dagster_history

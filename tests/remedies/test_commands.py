@@ -16,7 +16,7 @@ from tests.conftest import EXPERIMENT, ROOT, Checkout
 from tests.remedies.remedied import remedied
 from traps_pipeline.exchange import harness_logs
 from traps_pipeline.exchange.answer_exchange import Whose, checked_answers, export_requests, import_answers
-from traps_pipeline.exchange.batch import FOLDER, export_batches
+from traps_pipeline.exchange.provider_batch import FOLDER, export_batches
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
@@ -56,10 +56,12 @@ def test_an_export_goes_to_another_folder_or_to_one_that_was_deleted(unasked_cop
     (out / FOLDER / "batch.jsonl").write_text("{}")
     remedied(
         lambda: export_batches({}, out),
-        "exchange.batch.export_batches",
+        "exchange.provider_batch.export_batches",
         again=lambda: export_batches({}, tmp_path / "third"),
     )
-    remedied(lambda: export_batches({}, out), "exchange.batch.export_batches", lambda: shutil.rmtree(out / FOLDER))
+    remedied(
+        lambda: export_batches({}, out), "exchange.provider_batch.export_batches", lambda: shutil.rmtree(out / FOLDER)
+    )
 
 
 def test_answers_are_imported_once_it_is_said_whose_they_are_and_no_error_is_among_them(

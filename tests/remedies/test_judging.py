@@ -15,8 +15,8 @@ from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import collect_votes, judged_answers, wanted_ballots
 from traps_pipeline.judging.robustness import check_panel, load_attacks
 from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study

@@ -22,7 +22,7 @@ from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
-from traps_pipeline.report.explorer.answers import study_items
+from traps_pipeline.report.explorer.answer_shards import study_items
 from traps_pipeline.scenes.worlds.clips import read_clip
 from traps_pipeline.servers.annotate import Annotation
 from traps_pipeline.servers.review import Review
@@ -48,7 +48,7 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
         refused(lambda: scoring_stages._make_robust(workspace, None), "pipeline.stages.scoring_stages"),
         refused(lambda: judging_stages._votes(workspace, "agreement"), "pipeline.stages.judging_stages"),
         refused(lambda: Annotation(workspace), "servers.annotate"),
-        refused(lambda: study_items(workspace), "report.explorer.answers.study_items"),
+        refused(lambda: study_items(workspace), "report.explorer.answer_shards.study_items"),
         refused(lambda: Review(workspace, "jd").specs, "servers.review.Review.specs"),
         refused(lambda: canary_items(workspace), "checks.canary.canary_items"),
         refused(lambda: export_requests(workspace, experiment, tmp_path / "out"), "exchange.answer_exchange"),

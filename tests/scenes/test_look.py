@@ -15,7 +15,7 @@ from tests.build.errors import raises
 from tests.scenes.released import load
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.cli.benchmark import LOOKS
+from traps_pipeline.cli.benchmark_commands import LOOKS
 from traps_pipeline.scenes.certification.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.redraw import relook_family, with_look

@@ -6,12 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.build.pooled import pooled_j
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import LEADERBOARD
-from traps_pipeline.scoring.standings import leaderboard, pooled_j, wrong_intervals
+from traps_pipeline.scoring.standings import leaderboard, wrong_intervals
 from traps_pipeline.storage.parquet import TableStore
 
 STRATEGIES = ["oracle", "always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"]

@@ -1,5 +1,5 @@
 """Progress of a run: its state and the events that change it. Library code reports to `current()`; a command installs
-a subclass that prints (`cli/progress.py`), and a Dagster step adds a listener (`Progress.heard_by`)."""
+a subclass that prints (`cli/printed_progress.py`), and a Dagster step adds a listener (`Progress.heard_by`)."""
 
 from __future__ import annotations
 

@@ -22,9 +22,9 @@ __all__ = ["dagster_yaml", "open_store", "runs", "sensors"]
 
 def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
     """See `SeveralHosts`."""
-    from traps_pipeline.cluster import history
+    from traps_pipeline.cluster import shared_history
 
-    return history.dagster_yaml(workspace)
+    return shared_history.dagster_yaml(workspace)
 
 
 def runs(workspace: Workspace, instance: dg.DagsterInstance, options: argparse.Namespace) -> Runs:

@@ -16,7 +16,7 @@ from pathlib import Path
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.history import logs_folder
+from traps_pipeline.cluster.shared_history import logs_folder
 from traps_pipeline.storage.workspace import Workspace
 
 UPLOAD_S = 30.0

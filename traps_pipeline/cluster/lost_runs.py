@@ -14,8 +14,8 @@ import dagster as dg
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.history import logs_folder
 from traps_pipeline.cluster.logs import fetch
+from traps_pipeline.cluster.shared_history import logs_folder
 from traps_pipeline.storage.workspace import Workspace
 
 LOST_S = 90  # after so long a run that Ray knows nothing of was never submitted, or Ray's head lost it

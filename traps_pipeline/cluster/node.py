@@ -13,9 +13,9 @@ from contextlib import suppress
 from typing import NoReturn
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.history import export
 from traps_pipeline.cluster.logs import uploading
 from traps_pipeline.cluster.same_code import CODE, require_same_code
+from traps_pipeline.cluster.shared_history import export
 from traps_pipeline.storage.workspace import Workspace
 
 REFUSED_TAG = "traps/refused"  # of a run that its node did not begin

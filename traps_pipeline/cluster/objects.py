@@ -1,8 +1,8 @@
 """A study's files in an object store (S3, Google, Azure), for several hosts.
 
-An object is written once, under the SHA-256 of its content, and never renamed; `names.py` says which is current under a
-path. A host keeps what it has fetched in its scratch folder, below `.objects` under the same digests, and links it to
-the paths that people and code know. What is read has the size and the digest of its row.
+An object is written once, under the SHA-256 of its content, and never renamed; `object_names.py` says which is current
+under a path. A host keeps what it has fetched in its scratch folder, below `.objects` under the same digests, and links
+it to the paths that people and code know. What is read has the size and the digest of its row.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import TypeVar
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.database import Database, lease
-from traps_pipeline.cluster.names import Current, Names
+from traps_pipeline.cluster.cluster_database import Database, lease
+from traps_pipeline.cluster.object_names import Current, Names
 from traps_pipeline.storage.place import STUDY
 from traps_pipeline.storage.store import GRACE_DAYS, Lease, Store, UnusedObject, is_hidden
 

@@ -9,7 +9,7 @@ import yaml
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.database import Database, database_of, lease
+from traps_pipeline.cluster.cluster_database import Database, database_of, lease
 from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import FolderStore, Lease, Store

@@ -9,8 +9,8 @@ from typing import Any
 
 from traps_pipeline.base.cores import CORES
 from traps_pipeline.cluster.same_code import CODE, code_here
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.registry import LOCAL, get_model
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.ranges import Range
 from traps_pipeline.protocol.cells import Cell

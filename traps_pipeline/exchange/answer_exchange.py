@@ -22,18 +22,18 @@ from traps_pipeline.base.files import replacing, write_bytes
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
-from traps_pipeline.exchange.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, Given, reader_of
+from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.rows import MOST_TOKENS, Stored
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT, Outcome, OutcomeKind, Request
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.benchmark_tables import ITEMS

@@ -30,6 +30,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.judging.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
 from traps_pipeline.judging.judging_rows import VoteRow
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
@@ -47,7 +48,6 @@ from traps_pipeline.models.judges import (
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.parquet import Made, joined

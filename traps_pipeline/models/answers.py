@@ -12,6 +12,7 @@ from typing import Any
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.models.answer_rows import ResponseRow
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.framing import framed
 from traps_pipeline.models.participants import Row, when_asked
@@ -19,7 +20,6 @@ from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.tables import ResponseRow
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.storage.benchmark_tables import ITEMS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 
 from traps_pipeline.base.digests import digest
@@ -11,13 +11,6 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.protocol.regimes import BY_NAME
 
 PROMPTS = ASSETS / "prompts"
-# The fields of the object that an answer must be, by what asks for it; any other answer is free text.
-FIELDS: Mapping[str, tuple[str, ...]] = {
-    **{name: regime.fields for name, regime in BY_NAME.items() if regime.fields},
-    "schema_answer": ("final_answer",),
-    "schema_reason": ("reason", "final_answer"),
-    "schema_abstain": ("reason", "abstain", "final_answer"),
-}
 _SCHEMA_PARTS = {
     "schema_answer": "json_answer_suffix",
     "schema_reason": "json_suffix",
@@ -36,12 +29,6 @@ def prompt(name: str) -> str:
     if not text:
         raise TrapsError(f"{path}: is empty; restore it from git")
     return text
-
-
-def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
-    """The fields of the object that an answer must be under a regime, in a dataset that may vary it; None for free
-    text."""
-    return FIELDS.get(dataset, FIELDS.get(regime))
 
 
 @cache

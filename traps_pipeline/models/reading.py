@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from traps_pipeline.models.endings import ending_of
-from traps_pipeline.models.prompts import fields_of
 from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
 from traps_pipeline.models.thinking import (
     Marks,
@@ -23,9 +22,9 @@ from traps_pipeline.models.thinking import (
     strip_tokens,
     undeclared_mark,
 )
+from traps_pipeline.protocol.regimes import fields_of
 
 READING = "4"  # version of this module's rules; the answers' tables are stale when it is raised
-FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)  # what announces the final answer
 # A final answer that is announced as such and ends before the text does: one that is cut off may be another.
 _STATED = re.compile(
     r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*answer[\W_]*?(?:\bis\b\s*:?|[:=])[\s*_\"'`]*"

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.models.prompts import fields_of
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.datasets import dataset_of
+from traps_pipeline.protocol.regimes import fields_of
 
 ABSTENTION = "I don't know"
 Strategy = Callable[[Request], str | None]  # the label answered, None for an abstention

@@ -22,9 +22,9 @@ from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
-from traps_pipeline.models.prompts import FIELDS, fields_of
 from traps_pipeline.models.thinking import Marks, marks_of
 from traps_pipeline.protocol.cells import Evaluation
+from traps_pipeline.protocol.regimes import fields_of
 from traps_pipeline.storage.media import MediaSpec, profile_digest
 
 MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry
@@ -58,11 +58,8 @@ _TYPES = {"reason": "string", "abstain": "boolean", "final_answer": "string"}
 
 
 def answer_object(fields: Iterable[str]) -> dict[str, Any]:
-    """The `response_format` of an answer with these fields (`prompts.FIELDS`)."""
+    """The `response_format` of an answer with these fields (`regimes.FIELDS`)."""
     return structured("answer", **{name: {"type": _TYPES[name]} for name in fields})
-
-
-JSON_ANSWER = answer_object(FIELDS["json"])  # of the JSON regime (`prompts/json_suffix.txt`)
 
 
 class Limits(BaseModel):

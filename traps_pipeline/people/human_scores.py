@@ -21,12 +21,12 @@ from traps_pipeline.scoring.bootstrap import (
     SEED,
     draw_scenarios,
     figures_of,
-    interval,
     limits_of,
     means_over_runs,
     run_sums,
+    with_interval,
 )
-from traps_pipeline.scoring.metrics import COUNTS, decision_counts
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_versions
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
@@ -66,16 +66,12 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
         "agreement": agreement,
         "alpha": alpha,
         "seconds": float(np.median(clips["seconds"].to_numpy(float))),
-        "benchmark_version": " + ".join(sorted(set(clips["benchmark_version"]))),
+        "benchmark_version": joined_versions(clips["benchmark_version"]),
     }
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
     """Each figure with its interval, as columns, from ends of which the first is what was observed: (2, names, 1 +
     resamples)."""
-    columns: dict[str, float] = {}
-    for k, name in enumerate(names):
-        own = float(draws[1, k, 0])
-        low, high = interval(draws[:, k, 1:], own, limits_of(name))
-        columns |= {f"{name}{suffix}": own, f"{name}{suffix}_ci_low": low, f"{name}{suffix}_ci_high": high}
-    return columns
+    columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
+    return {name: value for of_figure in columns for name, value in of_figure.items()}

@@ -28,7 +28,7 @@ from traps_pipeline.judging.confabulation import (
     sample_id,
 )
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.benchmark_tables import ITEMS

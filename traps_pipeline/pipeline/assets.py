@@ -7,8 +7,8 @@ from typing import Any, cast
 import dagster as dg
 from pydantic import PrivateAttr
 
-from traps_pipeline.pipeline.checks import CURRENT, CURRENT_DOC
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
+from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
 from traps_pipeline.pipeline.step import Event, guarded, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
 from traps_pipeline.storage.place import place_of

@@ -21,11 +21,11 @@ from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.pipeline.assets import WorkspaceResource
-from traps_pipeline.pipeline.checks import CURRENT
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.machine import require_machine, wanted_parts
+from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import pending_in, walk
 from traps_pipeline.pipeline.runs import RunsHere, range_tags

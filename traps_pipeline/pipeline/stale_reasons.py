@@ -9,9 +9,9 @@ from typing import Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.judging.judging_rows import VOTES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.benchmark_tables import ITEMS

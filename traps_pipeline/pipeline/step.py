@@ -22,13 +22,13 @@ from dagster._core.definitions.source_asset import SYSTEM_METADATA_KEY_SOURCE_AS
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.redaction import redacted
-from traps_pipeline.pipeline.checks import StageChecks, raise_for_run
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, write_report_state
 from traps_pipeline.pipeline.machine import parts_of_run, require_machine, why_nothing
 from traps_pipeline.pipeline.making import PartitionMaker
 from traps_pipeline.pipeline.metadata import partition_metadata, visible_metadata
+from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.workspace import Workspace

@@ -31,12 +31,25 @@ BY_NAME: Mapping[str, Regime] = {
         Regime("json", ("standard", "json_suffix"), fields=("reason", "final_answer")),
     )
 }
+# The fields of the object that an answer must be, by what asks for it; any other answer is free text.
+FIELDS: Mapping[str, tuple[str, ...]] = {
+    **{name: regime.fields for name, regime in BY_NAME.items() if regime.fields},
+    "schema_answer": ("final_answer",),
+    "schema_reason": ("reason", "final_answer"),
+    "schema_abstain": ("reason", "abstain", "final_answer"),
+}
 REGIMES = tuple(BY_NAME)
 PAPER_REGIMES = ("standard", "guided", "json")  # what the paper asks, and an experiment that names no regimes
 VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)
 # The paper compares answers under these two: the plain prompt, and the one that permits an abstention.
 STANDARD, GUIDED = PROMPTING = ("standard", "guided")
 PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
+
+
+def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
+    """The fields of the object that an answer must be under a regime, in a dataset that may vary it; None for free
+    text."""
+    return FIELDS.get(dataset, FIELDS.get(regime))
 
 
 def one_of(names: tuple[str, ...]) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from traps_pipeline.release.tables import HELD_OUT_ITEMS, PAIRS, RELEASED_ITEMS
+from traps_pipeline.release.released_rows import HELD_OUT_ITEMS, PAIRS, RELEASED_ITEMS
 from traps_pipeline.storage.tables import Table
 
 # Tables whose rows have clips. The hub's loader reads all configurations of a folder with one builder, that of videos;

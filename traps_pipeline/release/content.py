@@ -19,7 +19,7 @@ from traps_pipeline.models.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.release.tables import (
+from traps_pipeline.release.released_rows import (
     CertificateRow,
     HeldOutItemRow,
     PairRow,
@@ -35,7 +35,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = "clips"
-DATA_LICENCE, PROMPT_LICENCE = "CC-BY-4.0", "CC-BY-NC-4.0"
+PROMPT_LICENCE = "CC-BY-NC-4.0"
 SYSTEM, JUDGE = "system prompt of a model", "prompt of a judge"
 _CLIPS = f"{CLIPS}/"
 

@@ -20,7 +20,7 @@ from traps_pipeline.release.card import card, dictionary
 from traps_pipeline.release.checksums import CHECKSUMS, SIGNATURE, write_checksums
 from traps_pipeline.release.content import CLIPS, Content
 from traps_pipeline.release.croissant import croissant
-from traps_pipeline.release.tables import (
+from traps_pipeline.release.released_rows import (
     CERTIFICATES,
     HELD_OUT,
     HELD_OUT_ITEMS,

@@ -19,9 +19,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.registry import is_reference
-from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.protocol.metrics import METRIC_WORDS
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.release.submission import table_bytes
 from traps_pipeline.scoring.bootstrap import RESAMPLES
 from traps_pipeline.scoring.score_rows import LEADERBOARD

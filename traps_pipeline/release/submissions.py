@@ -14,8 +14,8 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.models.judges import id_of_seats
+from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
-from traps_pipeline.release.tables import SUBMITTED
 from traps_pipeline.release.verification import Verified, verify
 from traps_pipeline.report.leaderboard_page import leaderboards, legend
 from traps_pipeline.report.writing import environment, table_html

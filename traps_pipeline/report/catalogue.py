@@ -150,193 +150,89 @@ class FigureReport:
         return figure
 
 
-Report = TableReport | FigureReport
-
 TABLES: tuple[TableReport, ...] = (
     TableReport("overall", leaderboards.overall, ("leaderboard",), printed_scores.overall, recomputed=("overall",)),
-    TableReport(
-        "replication_overall",
-        leaderboards.replication_overall,
-        ("leaderboard",),
-        printed_scores.replication_overall,
-        recomputed=("replication_overall",),
-    ),
+    TableReport("replication_overall", leaderboards.replication_overall, ("leaderboard",),
+        printed_scores.replication_overall, recomputed=("replication_overall",)),
     TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_scores.per_dataset),
-    TableReport(
-        "expanded", leaderboards.expanded, ("leaderboard",), printed_scores.expanded, title="By dataset and regime"
-    ),
-    TableReport(
-        "replication_per_dataset",
-        leaderboards.replication_per_dataset,
-        ("leaderboard",),
-        printed_scores.replication_per_dataset,
-    ),
-    TableReport(
-        "guided_uplift",
-        comparisons.uplift,
-        ("leaderboard", "contrasts"),
-        printed_scores.guided_uplift,
-        recomputed=("guided_uplift",),
-    ),
-    TableReport(
-        "visual_textual",
-        comparisons.visual_textual,
-        ("leaderboard",),
-        printed_scores.visual_textual,
-        recomputed=("visual_textual",),
-    ),
-    TableReport(
-        "reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts"), recomputed=("reasoning_pairs",)
-    ),
+    TableReport("expanded", leaderboards.expanded, ("leaderboard",), printed_scores.expanded,
+        title="By dataset and regime"),
+    TableReport("replication_per_dataset", leaderboards.replication_per_dataset, ("leaderboard",),
+        printed_scores.replication_per_dataset),
+    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts"), printed_scores.guided_uplift,
+        recomputed=("guided_uplift",)),
+    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",), printed_scores.visual_textual,
+        recomputed=("visual_textual",)),
+    TableReport("reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts"),
+        recomputed=("reasoning_pairs",)),
     TableReport("frontier", comparisons.frontier, ("leaderboard",), recomputed=("frontier",)),
     TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_scores.naive, recomputed=("pecs_naive",)),
-    TableReport(
-        "zero_boundary",
-        comparisons.zero_boundary,
-        ("leaderboard",),
-        printed_scores.zero_boundary,
-        recomputed=("zero_boundary",),
-    ),
+    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",), printed_scores.zero_boundary,
+        recomputed=("zero_boundary",)),
     TableReport("contrasts", comparisons.contrasts, ("leaderboard", "contrasts")),
     TableReport("regime_tests", comparisons.regime_tests, ("regime_tests",)),
-    TableReport(
-        "run_spread", comparisons.spreads, ("leaderboard",), printed_scores.run_spread, recomputed=("run_spread",)
-    ),
+    TableReport("run_spread", comparisons.spreads, ("leaderboard",), printed_scores.run_spread,
+        recomputed=("run_spread",)),
     TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_scores.degenerate),
-    TableReport(
-        "occlusion_sub_scenarios",
-        sub_scenarios.occlusion_sub_scenarios,
-        ("metrics", "items"),
-        printed_scores.occlusion_sub_scenarios,
-        recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios"),
-    ),
-    TableReport(
-        "chaotic_sub_scenarios",
-        sub_scenarios.chaotic_sub_scenarios,
-        ("metrics", "items"),
-        printed_scores.chaotic_sub_scenarios,
-        recomputed=("chaotic_sub_scenarios",),
-    ),
+    TableReport("occlusion_sub_scenarios", sub_scenarios.occlusion_sub_scenarios, ("metrics", "items"),
+        printed_scores.occlusion_sub_scenarios, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
+    TableReport("chaotic_sub_scenarios", sub_scenarios.chaotic_sub_scenarios, ("metrics", "items"),
+        printed_scores.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
     TableReport("hypotheses", hypothesis_tables.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
     TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_setup.agreement),
     TableReport("judge_bias", judge_tables.judge_bias, ("judge_bias", "leave_one_out")),
-    TableReport(
-        "confabulation", judge_tables.confabulation, ("confabulation_prevalence",), printed_setup.confabulation
-    ),
+    TableReport("confabulation", judge_tables.confabulation, ("confabulation_prevalence",),
+        printed_setup.confabulation),
     TableReport("people", human_tables.people, ("human_row", "human_agreement"), title="People"),
-    TableReport(
-        "judge_corrected",
-        human_tables.judge_corrected,
-        ("panel_errors", "corrected"),
-        title="Corrected for judges’ errors",
-    ),
+    TableReport("judge_corrected", human_tables.judge_corrected, ("panel_errors", "corrected"),
+        title="Corrected for judges’ errors"),
     TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_setup.validation),
-    TableReport(
-        "probes",
-        tables_of_probes.probes,
-        ("probes", "probe_baselines"),
-        printed_mechanism.probes,
-        ("probe_means",),
-        "Probes",
-    ),
-    TableReport(
-        "probe_baselines",
-        control_reports.probe_baselines,
-        ("probes", "probe_baselines"),
-        title="Probes and their baselines",
-    ),
+    TableReport("probes", tables_of_probes.probes, ("probes", "probe_baselines"), printed_mechanism.probes,
+        ("probe_means",), "Probes"),
+    TableReport("probe_baselines", control_reports.probe_baselines, ("probes", "probe_baselines"),
+        title="Probes and their baselines"),
     TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", tables_of_patching.patching, ("patching",)),
-    TableReport(
-        "cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines, title="Void directions"
-    ),
-    TableReport(
-        "steering",
-        tables_of_mechanism.steering,
-        ("steering_effects", "steering_shares"),
-        printed_mechanism.steering,
-        recomputed=("steering_regimes",),
-        title="Steering",
-    ),
-    TableReport(
-        "steering_controls",
-        control_reports.steering_nulls,
-        ("steering_nulls", "steering_pecs"),
-        title="Steering among its controls",
-    ),
+    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines,
+        title="Void directions"),
+    TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"),
+        printed_mechanism.steering, recomputed=("steering_regimes",), title="Steering"),
+    TableReport("steering_controls", control_reports.steering_nulls, ("steering_nulls", "steering_pecs"),
+        title="Steering among its controls"),
     TableReport("composition", setup_tables.composition, ("items",), printed_setup.composition),
     TableReport("models", setup_tables.models, ("leaderboard",), printed_setup.models),
-    TableReport(
-        "hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"), printed_setup.hyperparameters
-    ),
-)
+    TableReport("hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"),
+        printed_setup.hyperparameters),
+)  # fmt: skip
 FIGURES: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),
     FigureReport("visual_textual", "Visual against textual voids", abstention.visual_textual, ("leaderboard",)),
     FigureReport("abs_rec", "AbsRec, standard and guided", abstention.abs_rec_by_model, ("leaderboard",)),
     FigureReport("reasoning_arrows", "Reasoning in PECS space", landscape.reasoning, ("leaderboard",)),
-    FigureReport(
-        "doubt_conversion", "Doubt and conversion", abstention.doubt, ("leaderboard", "confabulation_prevalence")
-    ),
+    FigureReport("doubt_conversion", "Doubt and conversion", abstention.doubt,
+        ("leaderboard", "confabulation_prevalence")),
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", grids.sub_scenarios, ("metrics", "items")),
     FigureReport("confabulation", "Prevalence of confabulation", grids.confabulation, ("confabulation_prevalence",)),
-    FigureReport(
-        "states_and_output",
-        "States against output, item by item",
-        expression_figures.states_and_output,
-        ("item_scores", "sentences", "probe_baselines"),
-        published=False,
-        finding=findings.states_and_output,
-    ),
-    FigureReport(
-        "lens", "The margin by layer", expression_figures.lens, ("lens",), published=False, finding=findings.lens
-    ),
-    FigureReport(
-        "probe_baselines",
-        "Probes against their baselines",
-        figures_of_inside.probe_baselines,
-        ("probes", "probe_baselines"),
-        published=False,
-        finding=findings.probe_baselines,
-    ),
-    FigureReport(
-        "gate_arrows",
-        "Probe-gated abstention",
-        figures_of_inside.gate_arrows,
-        ("gate", "risk_coverage"),
-        published=False,
-        finding=findings.gate_arrows,
-    ),
-    FigureReport(
-        "patching",
-        "Activation patching",
-        figures_of_inside.patching,
-        ("patching",),
-        published=False,
-        finding=findings.patching,
-    ),
-    FigureReport(
-        "doses_among_nulls",
-        "Doses among nulls",
-        figures_of_inside.doses_among_nulls,
-        ("steering_effects", "steering_nulls"),
-        published=False,
-        finding=findings.doses_among_nulls,
-    ),
-    FigureReport(
-        "probe_curves", "Probe transfer by layer", steering_figures.probe_curves, ("probes",), published=False
-    ),
-    FigureReport(
-        "confabulated_strip", "Probes on confabulated voids", steering_figures.confabulated_strip, ("probes",)
-    ),
-    FigureReport(
-        "dose_response",
-        "Steering: dose and response",
-        steering_figures.dose_response,
-        ("steering_effects", "steering_shares"),
-    ),
+    FigureReport("states_and_output", "States against output, item by item", expression_figures.states_and_output,
+        ("item_scores", "sentences", "probe_baselines"), published=False, finding=findings.states_and_output),
+    FigureReport("lens", "The margin by layer", expression_figures.lens, ("lens",), published=False,
+        finding=findings.lens),
+    FigureReport("probe_baselines", "Probes against their baselines", figures_of_inside.probe_baselines,
+        ("probes", "probe_baselines"), published=False, finding=findings.probe_baselines),
+    FigureReport("gate_arrows", "Probe-gated abstention", figures_of_inside.gate_arrows, ("gate", "risk_coverage"),
+        published=False, finding=findings.gate_arrows),
+    FigureReport("patching", "Activation patching", figures_of_inside.patching, ("patching",), published=False,
+        finding=findings.patching),
+    FigureReport("doses_among_nulls", "Doses among nulls", figures_of_inside.doses_among_nulls,
+        ("steering_effects", "steering_nulls"), published=False, finding=findings.doses_among_nulls),
+    FigureReport("probe_curves", "Probe transfer by layer", steering_figures.probe_curves, ("probes",),
+        published=False),
+    FigureReport("confabulated_strip", "Probes on confabulated voids", steering_figures.confabulated_strip,
+        ("probes",)),
+    FigureReport("dose_response", "Steering: dose and response", steering_figures.dose_response,
+        ("steering_effects", "steering_shares")),
     FigureReport("cosines", "Cosines of void directions", steering_figures.cosine_heatmaps, ("cosines",)),
-)
+)  # fmt: skip
 
 # Figures that a study leads with which looked inside models: the claim, and what can refute it.
 INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patching", "doses_among_nulls")

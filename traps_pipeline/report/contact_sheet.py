@@ -1,4 +1,4 @@
-"""Contact sheets: frames of controls above frames of voids, for a reviewer's first look (docs/spec.md 10)."""
+"""Pairs of clips as pictures: frames of controls above frames of voids (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
+from traps_pipeline.report.writing import figure_style, new_figure
 from traps_pipeline.scenes.parts.vision import before_panel
 from traps_pipeline.video.encode import decode
 
@@ -19,32 +19,35 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOMENTS = 4  # frames per clip
 GAP = 8  # pixels between frames
 FOOTER_IN = 0.2  # room for the times below a pair's frames
-MOST_PAIRS = 80
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Widths (inches), dots per inch, and the number of letters of a question that fit on a line of a pair."""
+    """Widths (inches) and words of a pair: by default as for the width of a printed page, on which no text may be
+    smaller than 6 points. header: room for the words above its frames; letters: of a question on a line; questions:
+    lines of each question at most; ids: whether its scenario is named; moments: frames per clip; columns: pairs beside
+    each other."""
 
-    block: float = 6.4
-    header: float = 0.95  # room for the words above a pair's frames
-    gap: float = 0.5
-    dpi: int = 150
-    size: float = 8
-    letters: int = 108
-    questions: int = 2  # lines of each question at most
-    ids: bool = True  # whether scenarios are named
-    moments: int = MOMENTS  # frames per clip
+    block: float = 1.98
+    header: float = 0.86
+    gap: float = 0.28
+    letters: int = 41
+    questions: int = 4
+    ids: bool = False
+    moments: int = 3
+    columns: int = 3
+    dpi: int = 300
+    size: float = 6.5
+
+    @property
+    def small(self) -> float:
+        """The size of words between and below frames."""
+        return min(self.size, 7)
 
 
-# For a screen, and for the width of a printed page, on which no text may be smaller than 6 points.
-SCREEN = Layout()
-PAGE = Layout(
-    block=1.98, header=0.86, gap=0.28, dpi=300, size=6.5, letters=41, questions=4, ids=False, moments=3
-)  # fmt: skip
+PAGE = Layout()
 
 
 @dataclass(frozen=True)
@@ -57,22 +60,14 @@ class SampledClip:
     end_s: float
 
 
-def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2) -> bytes:
-    """The PNG of `pairs_figure`."""
-    return figure_bytes(pairs_figure(items, root, per_family, columns))
-
-
-def pairs_figure(
-    items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2, layout: Layout = SCREEN
-) -> Figure:
+def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figure:
     """For each pair, a row of control frames above a row of void frames at the same times, from start to end.
 
-    items are ITEMS rows with both sides of each pair, and clips lie under root. Of every dataset and sub-scenario the
-    first `per_family` pairs by id are shown, or all if it is None. Times after a truncated void's end are hatched.
-    Raises ValueError when there is no whole pair or more than 80, and DamagedClip when a clip cannot be decoded.
+    items are ITEMS rows with both sides of each pair, and clips lie under root. Times after a truncated void's end are
+    hatched. Raises DamagedClip when a clip cannot be decoded.
     """
-    pairs = chosen_pairs(items, per_family)
-    columns = min(columns, len(pairs))
+    pairs = whole_pairs(items)
+    columns = min(layout.columns, len(pairs))
     with figure_style():
         blocks = [moments_of(pair, root, layout.moments) for pair in pairs]
         heights = [layout.block * ratio_of(control) + layout.header + FOOTER_IN for control, _, _ in blocks]
@@ -102,24 +97,11 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
     return visual.loc[visual["pair_id"].isin(chosen)]
 
 
-def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFrame]:
-    """The pairs to show, as frames of two rows indexed by side. Raises ValueError for none or more than 80."""
-    whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2].sort_values(
-        by=["dataset", "sub_scenario", "pair_id"], key=_in_order
-    )
-    firsts = whole.drop_duplicates("pair_id").groupby(["dataset", "sub_scenario"], sort=False)["pair_id"]
-    ids = list(firsts.head(per_family) if per_family is not None else whole["pair_id"].unique())
-    if not 0 < len(ids) <= MOST_PAIRS:
-        raise ValueError(
-            f"a contact sheet shows 1 to {MOST_PAIRS} pairs, not {len(ids)}: pass other items or a smaller per_family"
-        )
-    by_pair = dict(list(whole[whole["pair_id"].isin(ids)].groupby("pair_id")))
-    return [by_pair[pair_id].set_index("side") for pair_id in ids]
-
-
-def _in_order(values: pd.Series) -> pd.Series:
-    """Datasets in the benchmark's order, occlusion first; other columns as they are."""
-    return values.map(DATASETS.index) if values.name == "dataset" else values
+def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
+    """The pairs that have both sides, occlusion first, as frames of two rows indexed by side."""
+    whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
+    whole = whole.assign(place=whole["dataset"].map(DATASETS.index)).sort_values(["place", "sub_scenario", "pair_id"])
+    return [pair.set_index("side") for _, pair in whole.groupby("pair_id", sort=False)]
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
@@ -160,6 +142,7 @@ def draw_pair(
     from matplotlib.patches import Rectangle
 
     moments, height, width, _ = control.frames.shape
+    middle: dict[str, Any] = {"ha": "center", "va": "center"}
     canvas = np.full((2 * height + GAP, moments * width + (moments - 1) * GAP, 3), 255, np.uint8)
     for row, (side, clip) in enumerate({"control": control, "void": void}.items()):
         top = row * (height + GAP)
@@ -173,25 +156,12 @@ def draw_pair(
             axes.add_patch(Rectangle((left, top), width - 1, height - 1, **hatch))
             box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
             axes.text(
-                left + width / 2,
-                top + height / 2,
-                f"cut at {clip.end_s:.1f} s",
-                ha="center",
-                va="center",
-                size=min(layout.size, 7),
-                bbox=box,
+                left + width / 2, top + height / 2, f"cut at {clip.end_s:.1f} s", bbox=box, size=layout.small, **middle
             )
     axes.imshow(canvas, interpolation="antialiased")
     for k, time in enumerate(times):
-        axes.text(
-            k * (width + GAP) + width / 2,
-            2 * height + 2 * GAP,
-            f"{time:.1f} s",
-            ha="center",
-            va="top",
-            size=min(layout.size, 7),
-            color="#667085",
-        )
+        place = (k * (width + GAP) + width / 2, 2 * height + 2 * GAP)
+        axes.text(*place, f"{time:.1f} s", ha="center", va="top", size=layout.small, color="#667085")
     axes.set_axis_off()
     _draw_header(axes, pair, layout)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.arms_sheet import arms_sheets
-from traps_pipeline.report.contact_sheet import PAGE, pairs_figure, six_pairs
+from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
 from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
 from traps_pipeline.report.worked_example import Example, example_figure, worked_example
 from traps_pipeline.report.writing import NotRun
@@ -92,7 +92,7 @@ class PairPictures:
     def _six(self, rows: pd.DataFrame) -> Figure:
         if not len(rows):
             raise NotRun(NO_ITEMS)
-        return _readable(lambda: pairs_figure(rows, self.workspace.bring(rows["clip"]), None, 3, PAGE))
+        return _readable(lambda: pairs_figure(rows, self.workspace.bring(rows["clip"])))
 
     def _arms(self) -> Mapping[str, Figure]:
         clips = [*self.items["clip"], *self.arms["clip"].dropna()] if len(self.arms) else []

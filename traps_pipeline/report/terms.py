@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from traps_pipeline.protocol.datasets import ARMS, VARIATIONS
-from traps_pipeline.protocol.metrics import METRIC_WORDS, SHARES
+from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW
 
 TITLES = {

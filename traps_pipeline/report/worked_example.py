@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report.contact_sheet import Layout, draw_pair, moments_of, ratio_of
 from traps_pipeline.report.writing import PAGE_IN, figure_style, new_figure, plain
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
 
 SCENE = "seesaw_sorter"  # of the paper's example
-FRAMES = Layout(block=3.0, header=0.62, gap=0.4, dpi=300, size=6.5, letters=64, questions=2, moments=3)
+FRAMES = Layout(block=3.0, header=0.62, gap=0.4, letters=64, questions=2, ids=True)
 WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # of the column of words beside the frames
 
 

@@ -108,6 +108,12 @@ def interval(
     return np.where(nothing, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
 
 
+def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
+    """Return a figure and its interval as columns, from ends (2, 1 + resamples), the first of which were observed."""
+    low, high = interval(ends[:, 1:], ends[1, 0], limits)
+    return {name: float(ends[1, 0]), f"{name}_ci_low": float(low), f"{name}_ci_high": float(high)}
+
+
 def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the ends of left - right from theirs, (.., 2, resamples) each: an unseen scenario may be the worst for one
     and the best for the other."""

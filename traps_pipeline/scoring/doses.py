@@ -23,12 +23,12 @@ from traps_pipeline.scoring.bootstrap import (
     difference,
     draw_scenarios,
     figures_of,
-    interval,
     limits_of,
     run_sums,
     shares_of,
+    with_interval,
 )
-from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
 
 VISUAL = ("occlusion", "chaotic")
@@ -172,14 +172,14 @@ def _row(
         "chance": float((1 / items.loc[control, "offered"]).mean()) if control.any() else None,
         "panel": joined_epochs(items["panel"]),
         "epoch": joined_epochs(items["epoch"]),
-        "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
+        "benchmark_version": joined_versions(items["benchmark_version"]),
         "refused": None,
         "n_compared": None,
         "at_reference": None,
         **dict.fromkeys(_ends("change")),
     }
     for name in SHOWN:
-        row |= _told(name, figures[:, RESAMPLED.index(name)], limits_of(name))
+        row |= with_interval(name, figures[:, RESAMPLED.index(name)], limits_of(name))
     row["value"] = _compared(hypothesis, figures)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
@@ -195,7 +195,7 @@ def _row(
             for some, name in zip((shared, mine), names, strict=True)
         )
         row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[1, 0]}
-        row |= _told("change", difference(after, before), _CHANGE)
+        row |= with_interval("change", difference(after, before), _CHANGE)
     return row
 
 
@@ -217,12 +217,6 @@ def _compared(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
 
 def _ends(name: str) -> list[str]:
     return [name, f"{name}_ci_low", f"{name}_ci_high"]
-
-
-def _told(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, Any]:
-    """A figure, the first of its ends, and its interval; null where it has no denominator."""
-    values = [ends[1, 0], *interval(ends[:, 1:], ends[1, 0], limits)]
-    return dict(zip(_ends(name), [None if value != value else float(value) for value in values], strict=True))
 
 
 def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:

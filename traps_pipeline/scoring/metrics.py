@@ -81,7 +81,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["panel"] = groups["panel"].agg(joined_epochs)
-    sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
+    sums["benchmark_version"] = groups["benchmark_version"].agg(joined_versions)
     return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
 
 
@@ -93,6 +93,11 @@ def mean(values: pd.Series) -> float:
 def joined_epochs(epochs: Iterable[str]) -> str:
     """The distinct campaigns or panels, sorted and joined by `+`; an input may itself be such a list."""
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
+
+
+def joined_versions(versions: Iterable[str]) -> str:
+    """The distinct versions of the benchmark, sorted and joined; an input may itself be such a list."""
+    return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
 def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:

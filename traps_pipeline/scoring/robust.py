@@ -31,13 +31,13 @@ from traps_pipeline.scoring.bootstrap import (
     draw_scenarios,
     ends_of_pecs,
     figures_of,
-    interval,
     resampled_sums,
     run_sums,
     shares_of,
+    with_interval,
     with_unseen,
 )
-from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import ROBUST
 
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
@@ -111,15 +111,14 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> 
         "n_conjunction": max(n for _, n in conjunctions),
         "epoch": joined_epochs(items["epoch"]),
         "panel": joined_epochs(items["panel"]),
-        "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
+        "benchmark_version": joined_versions(items["benchmark_version"]),
         "refused": _refusal(items),
     }
     for name, by_run in figures.items():
         ends = np.mean(by_run, axis=0)
-        value = ends[1, 0]  # without an unseen scenario both ends are the figure, the upper one with J clipped
-        values = value, *interval(ends[:, 1:], value, (0.0, 1.0))
-        columns = (name, f"{name}_ci_low", f"{name}_ci_high")
-        row |= dict.fromkeys(columns) if row["refused"] else dict(zip(columns, values, strict=True))
+        # Without an unseen scenario both ends are the figure, the upper one with J clipped.
+        columns = with_interval(name, ends, (0.0, 1.0))
+        row |= dict.fromkeys(columns) if row["refused"] else columns
     inferred = items.loc[items["dataset"].isin(INFERENCE_ARMS)].groupby("run")[COUNTS].sum().reindex(list(runs))
     for name, count in (("inference_acc", "correct"), ("inference_abstains", "false_abs")):
         row[name] = (inferred[count] / inferred[f"{count}_of"].replace(0, np.nan)).mean(skipna=False)

@@ -17,8 +17,8 @@ from traps_pipeline.scoring.metrics import (
     COUNTED,
     FIGURES,
     REJECTS,
-    decision_counts,
     joined_epochs,
+    joined_versions,
     mean,
     pecs_of,
 )
@@ -52,7 +52,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["n_pairs"] = groups["n_pairs"].max()
     board["epoch"] = groups["epoch"].agg(joined_epochs)
     board["panel"] = groups["panel"].agg(joined_epochs)
-    board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
+    board["benchmark_version"] = groups["benchmark_version"].agg(joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
     board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
     board["broken"] = board[[*BROKEN]].sum(axis=1) / board["n_items"]
@@ -63,25 +63,6 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
     return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean))
-
-
-def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """J of each model over all its decided items pooled, with its binomial standard error: columns model, j,
-    standard_error, n (decided items of both sides).
-
-    The error combines sqrt(p (1 - p) / n) of the two sides; it holds for answers drawn independently, as the random
-    reference strategies draw them, and shows that these are indistinguishable from J = 0 (docs/spec.md 5.3).
-    """
-    counts = cast(pd.DataFrame, decision_counts(verdicts).groupby(verdicts["model"]).sum())
-    on_void, on_control = counts["abs_rec_of"].replace(0, np.nan), counts["false_abs_of"].replace(0, np.nan)
-    abs_rec, false_abs = counts["abs_rec"] / on_void, counts["false_abs"] / on_control
-    variance = abs_rec * (1 - abs_rec) / on_void + false_abs * (1 - false_abs) / on_control
-    pooled = {
-        "j": abs_rec - false_abs,
-        "standard_error": np.sqrt(variance),
-        "n": counts["abs_rec_of"] + counts["false_abs_of"],
-    }
-    return pd.DataFrame(pooled).reset_index()
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
@@ -109,7 +90,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     overall = whole[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["panel"] = whole["panel"].agg(joined_epochs)
-    overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
+    overall["benchmark_version"] = whole["benchmark_version"].agg(joined_versions)
     return overall.reset_index().assign(dataset="overall")
 
 
@@ -142,11 +123,6 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     }
     ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
     return pd.DataFrame(ranks).where(ranked).astype("Int64")
-
-
-def _joined_versions(versions: pd.Series) -> str:
-    """The distinct versions, sorted and joined by ` + `."""
-    return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:

@@ -13,7 +13,7 @@
 Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
 keep the order of the fields. Columns that stand beside a figure, such as the bounds of its interval, are declared by a
 mark (`Beside`) of the figure under the decorator `with_neighbours`. Each package declares its tables in a module
-`tables` or `..._rows`; columns that several packages share are in `storage.columns`. The Arrow schema is made from the
+`..._rows`; columns that several packages share are in `storage.columns`. The Arrow schema is made from the
 dataclass, and every file is checked against it on writing and on reading.
 """
 

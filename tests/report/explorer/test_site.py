@@ -18,10 +18,10 @@ from tests.build.cells import CELL, HOSTILE, row, write_cell
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.report.explorer import answers
-from traps_pipeline.report.explorer.answers import NO, NONE, StudyAnswers, study_answers
+from traps_pipeline.report.explorer import answer_shards
+from traps_pipeline.report.explorer.answer_shards import NO, NONE, StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scripts import data_script
 from traps_pipeline.report.explorer.site import INDEX, SCRIPT, script, write_site
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -103,7 +103,7 @@ def test_an_answer_that_no_judge_could_read_is_unread_and_its_text_stays(workspa
 
 
 def test_shards_follow_each_other_and_divide_no_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answers, "SHARD_ROWS", 7)
+    monkeypatch.setattr(answer_shards, "SHARD_ROWS", 7)
     items = pd.DataFrame({"pair_id": [f"p{k // 2}" for k in range(12)]})  # 6 pairs, 3 answers an item: 6 rows a pair
     item = np.repeat(np.arange(12), 3).astype(np.int32)
     item = item[item != 5]  # an item that was not asked
@@ -119,7 +119,7 @@ def test_shards_follow_each_other_and_divide_no_pair(monkeypatch: pytest.MonkeyP
         whole = {item[shard.first] // 2, item[shard.first + len(shard.texts) - 1] // 2}
         assert len(whole) == 1  # two pairs would be 9 or 12 rows
         assert np.array_equal(shard.votes["answer"].to_numpy() + shard.first, shard.votes["of"].to_numpy())
-    monkeypatch.setattr(answers, "SHARD_ROWS", 100)
+    monkeypatch.setattr(answer_shards, "SHARD_ROWS", 100)
     assert [len(s.texts) for s in study.shards()] == [33]
 
 
@@ -163,7 +163,7 @@ def test_only_clips_of_the_study_are_put_into_the_folder(workspace: Workspace, t
 
 
 def test_a_study_without_items_says_what_to_do(workspace: Workspace, tmp_path: Path) -> None:
-    with raises(TrapsError, "report.explorer.answers.study_items"):
+    with raises(TrapsError, "report.explorer.answer_shards.study_items"):
         write_site(workspace, tmp_path / "site")
     assert not (tmp_path / "site").exists()
 

@@ -5,13 +5,13 @@ from typing import Any, cast
 
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.judging.panel import collect_votes
+from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.models.answers import collect_answers
 from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import READING
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.pipeline.graph import Check, Collect
 from traps_pipeline.pipeline.previews import Records, StudyFile
 from traps_pipeline.pipeline.schemes import CELL, EVALUATION, by_dataset, by_evaluation

@@ -1,5 +1,6 @@
 """The controls of the mechanism group: baselines of probes, the gate, nulls of steering, patching."""
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.mechanism.control_rows import (
@@ -30,7 +31,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steering_effects,
     steers,
 )
-from traps_pipeline.pipeline.stages.tables_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
@@ -61,13 +62,20 @@ sentence_settings = source(
 )
 
 
-def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
-    """The model of an extraction, and its stored states."""
+def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
+    """The model of an extraction, and the extraction."""
     from traps_pipeline.mechanism.stages import examined_model
-    from traps_pipeline.mechanism.stored import StoredStates
 
     extraction = Extraction.parse(key)
-    return examined_model(workspace, extraction.model), StoredStates.of(workspace, extraction)
+    return examined_model(workspace, extraction.model), extraction
+
+
+def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
+    """The model of an extraction, and its stored states."""
+    from traps_pipeline.mechanism.stored import StoredStates
+
+    model, extraction = _model(workspace, key)
+    return model, StoredStates.of(workspace, extraction)
 
 
 def _make_baselines(workspace: Workspace, key: str) -> Made:
@@ -119,33 +127,23 @@ def _gated(wanted: Wanted, key: str) -> bool:
 
 _ASKED = (*DATASETS, *PROBED_ARMS)
 _GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in PROMPTING])
-_OF_GATE = [
-    of(hidden_states, by_extraction, need="some"),
-    of(probe_items, EVERY),
-    of(probes, SAME),
-    of(verdicts, _GATED, need="some"),
-    probing_settings,
-]
-gate = stage(
-    GATE,
-    _make_gate,
+_stage_of_gates = partial(
+    stage,
     group=GROUP,
     code="2",
-    parents=_OF_GATE,
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(probe_items, EVERY),
+        of(probes, SAME),
+        of(verdicts, _GATED, need="some"),
+        probing_settings,
+    ],
     scheme=EXTRACTION,
     wants=_gated,
     cost="machine",
 )
-risk_coverage = stage(
-    RISK_COVERAGE,
-    _make_curves,
-    group=GROUP,
-    code="2",
-    parents=_OF_GATE,
-    scheme=EXTRACTION,
-    wants=_gated,
-    cost="machine",
-)
+gate = _stage_of_gates(GATE, _make_gate)
+risk_coverage = _stage_of_gates(RISK_COVERAGE, _make_curves)
 
 
 def _make_lens(workspace: Workspace, key: str) -> Made:
@@ -191,10 +189,8 @@ item_scores = stage(
 def _make_sentences(workspace: Workspace, key: str) -> Made:
     """How likely whole abstentions are to a model behind every item, beside its own answers."""
     from traps_pipeline.mechanism.sentences import sentence_rows
-    from traps_pipeline.mechanism.stages import examined_model
 
-    extraction = Extraction.parse(key)
-    return Made(sentence_rows(workspace, examined_model(workspace, extraction.model), extraction))
+    return Made(sentence_rows(workspace, *_model(workspace, key)))
 
 
 def _read_in_sentences(wanted: Wanted, key: str) -> bool:
@@ -217,10 +213,8 @@ sentences = stage(
 def _make_patching(workspace: Workspace, key: str) -> Made:
     """Indirect effects of groups of positions between matched controls and voids, at every layer, beside nulls."""
     from traps_pipeline.mechanism.patched import patching_rows
-    from traps_pipeline.mechanism.stages import examined_model
 
-    extraction = Extraction.parse(key)
-    return Made(patching_rows(workspace, examined_model(workspace, extraction.model), extraction))
+    return Made(patching_rows(workspace, *_model(workspace, key)))
 
 
 patching = stage(
@@ -237,22 +231,16 @@ patching = stage(
 
 def _make_nulls(workspace: Workspace, _: None) -> Made:
     """The effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
-    import pandas as pd
-
     from traps_pipeline.mechanism.nulls import null_rows
 
-    table = pd.DataFrame(null_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_NULLS.names))
-    return Made(table, shown={"nulls": rows_shown(table)})
+    return made_of("nulls", STEERING_NULLS, null_rows(workspace.tables.read(STEERING_EFFECTS, {})))
 
 
 def _make_steering_pecs(workspace: Workspace, _: None) -> Made:
     """PECS of the steered model under each sign policy, with the share of degenerate answers."""
-    import pandas as pd
-
     from traps_pipeline.mechanism.nulls import pecs_rows
 
-    table = pd.DataFrame(pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_PECS.names))
-    return Made(table, shown={"pecs": rows_shown(table)})
+    return made_of("pecs", STEERING_PECS, pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})))
 
 
 steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, parents=[steering_effects], wants=steers)

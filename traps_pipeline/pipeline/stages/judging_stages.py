@@ -11,7 +11,7 @@ from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
 from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
-from traps_pipeline.pipeline.stages.tables_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -63,23 +63,19 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     return votes
 
 
-def _shown(name: str, frame: "pd.DataFrame") -> Made:
-    return Made(frame, shown={name: rows_shown(frame)})
-
-
 def _make_agreement(workspace: Workspace, _: None) -> Made:
     """Agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
     Krippendorff."""
     from traps_pipeline.judging.agreement import agreement
 
-    return _shown("agreement", agreement(_votes(workspace, "agreement"), _panel(workspace)))
+    return made_of("agreement", AGREEMENT, agreement(_votes(workspace, "agreement"), _panel(workspace)))
 
 
 def _make_judge_bias(workspace: Workspace, _: None) -> Made:
     """Each judge's rate of yes against the panel's majority, per dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias
 
-    return _shown("judge bias", judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
+    return made_of("judge bias", JUDGE_BIAS, judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
 
 
 def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
@@ -88,7 +84,9 @@ def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
     from traps_pipeline.scoring.leave_one_out import leave_one_out
 
     cast, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
-    return _shown("leave one out", leave_one_out(current(workspace, VERDICTS), cast, board, _panel(workspace)))
+    return made_of(
+        "leave one out", LEAVE_ONE_OUT, leave_one_out(current(workspace, VERDICTS), cast, board, _panel(workspace))
+    )
 
 
 def _make_confabulation(workspace: Workspace, _: None) -> Made:
@@ -109,7 +107,7 @@ def _make_prevalence(workspace: Workspace, _: None) -> Made:
     """How often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
     from traps_pipeline.scoring.prevalence import prevalence
 
-    return _shown("prevalence", prevalence(workspace.tables.read(CONFABULATION, {})))
+    return made_of("prevalence", CONFABULATION_PREVALENCE, prevalence(workspace.tables.read(CONFABULATION, {})))
 
 
 _VOTED = (of(items, need="some"), of(votes, need="some"), judges)

@@ -44,7 +44,7 @@ from traps_pipeline.pipeline.schemes import (
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.pipeline.stages.tables_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.pipeline.wanted import Wanted
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
@@ -202,12 +202,9 @@ directions = stage(
 
 def _make_cosines(workspace: Workspace, _: None) -> Made:
     """Cosines of every two void directions of a model at one layer, with their reliability."""
-    import pandas as pd
-
     from traps_pipeline.mechanism.cosines import cosine_rows
 
-    table = pd.DataFrame(cosine_rows(workspace))
-    return Made(table, shown={"cosines": rows_shown(table)})
+    return made_of("cosines", COSINES, cosine_rows(workspace))
 
 
 cosines = stage(
@@ -277,22 +274,16 @@ def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
 
 def _make_effects(workspace: Workspace, _: None) -> Made:
     """Abstention by path, kind of direction, layer, strength and side."""
-    import pandas as pd
-
     from traps_pipeline.mechanism.shares import effect_rows
 
-    table = pd.DataFrame(effect_rows(*_judged(workspace)), columns=pd.Index(STEERING_EFFECTS.names))
-    return Made(table, shown={"effects": rows_shown(table)})
+    return made_of("effects", STEERING_EFFECTS, effect_rows(*_judged(workspace)))
 
 
 def _make_shares(workspace: Workspace, _: None) -> Made:
     """Abstention over the paths of a set, with intervals by scenario."""
-    import pandas as pd
-
     from traps_pipeline.mechanism.shares import share_rows
 
-    table = pd.DataFrame(share_rows(*_judged(workspace)), columns=pd.Index(STEERING_SHARES.names))
-    return Made(table, shown={"shares": rows_shown(table)})
+    return made_of("shares", STEERING_SHARES, share_rows(*_judged(workspace)))
 
 
 _ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))

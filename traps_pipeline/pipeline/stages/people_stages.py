@@ -9,7 +9,7 @@ from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts
 from traps_pipeline.pipeline.stages.judging_stages import confabulation
-from traps_pipeline.pipeline.stages.tables_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -42,10 +42,6 @@ annotation_protocol = source(
 )
 
 
-def _shown(name: str, frame: "pd.DataFrame") -> Made:
-    return Made(frame, shown={name: rows_shown(frame)})
-
-
 def _make_labels(workspace: Workspace, _: None) -> Made:
     """People's labels of clips and answers that the study has, each with its item and what the panel decided; empty
     until somebody has labelled."""
@@ -58,14 +54,14 @@ def _make_agreement(workspace: Workspace, _: None) -> Made:
     """How far people agree, by task and decision."""
     from traps_pipeline.people.labels import human_agreement
 
-    return _shown("agreement of people", human_agreement(workspace.tables.read(HUMAN_LABELS, {})))
+    return made_of("agreement of people", HUMAN_AGREEMENT, human_agreement(workspace.tables.read(HUMAN_LABELS, {})))
 
 
 def _make_row(workspace: Workspace, _: None) -> Made:
     """Acc, AbsRec, FalseAbs and PECS of people with intervals, their agreement, and the seconds that a clip takes."""
     from traps_pipeline.people.human_scores import human_row
 
-    return _shown("people", human_row(workspace.tables.read(HUMAN_LABELS, {})))
+    return made_of("people", HUMAN_ROW, human_row(workspace.tables.read(HUMAN_LABELS, {})))
 
 
 def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
@@ -83,14 +79,14 @@ def _make_errors(workspace: Workspace, _: None) -> Made:
     """Sensitivity and specificity of the panel against people, by task; empty while it is not validated."""
     from traps_pipeline.people.corrected_scores import panel_errors
 
-    return _shown("the panel against people", panel_errors(*_labels_and_verdicts(workspace)))
+    return made_of("the panel against people", PANEL_ERRORS, panel_errors(*_labels_and_verdicts(workspace)))
 
 
 def _make_corrected(workspace: Workspace, _: None) -> Made:
     """Every entry of the leaderboard as judged, and corrected for the panel's errors."""
     from traps_pipeline.people.corrected_scores import corrected
 
-    return _shown("judged and corrected", corrected(*_labels_and_verdicts(workspace)))
+    return made_of("judged and corrected", CORRECTED, corrected(*_labels_and_verdicts(workspace)))
 
 
 _LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, confabulation))

@@ -10,7 +10,7 @@ from traps_pipeline.pipeline.schemes import DATASET, by_dataset
 from traps_pipeline.pipeline.stage import of, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.pipeline.stages.tables_shown import rows_shown
+from traps_pipeline.pipeline.stages.tables_shown import made_of, rows_shown
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.scoring.score_rows import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
@@ -83,8 +83,7 @@ def _make_regime_tests(workspace: Workspace, _: None) -> Made:
     """McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
-    table = mcnemar(_scored(workspace, "regime_tests")[1])
-    return Made(table, shown={"regime tests": rows_shown(table)})
+    return made_of("regime tests", REGIME_TESTS, mcnemar(_scored(workspace, "regime_tests")[1]))
 
 
 def _make_leaderboard(workspace: Workspace, _: None) -> Made:
@@ -116,8 +115,7 @@ def _make_robust(workspace: Workspace, _: None) -> Made:
     judged = current(workspace, VERDICTS, dataset=(*DATASETS, *ARMS))
     if judged.empty:
         raise TrapsError("robust: no verdicts yet; materialize verdicts for a cell first")
-    table = without_shortcuts(judged)
-    return Made(table, shown={"conjunction": rows_shown(table)})
+    return made_of("conjunction", ROBUST, without_shortcuts(judged))
 
 
 def _wrong_robust(workspace: Workspace, key: str | None, made: Made) -> str:
@@ -138,8 +136,7 @@ def _make_hypotheses(workspace: Workspace, _: None) -> Made:
     judged = current(workspace, VERDICTS, dataset=DATASETS_READ)
     items = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
     offered = {str(id_): len(labels) for id_, labels in zip(items["item_id"], items["labels"], strict=True)}
-    table = by_dose(judged, offered)
-    return Made(table, shown={"doses": rows_shown(table)})
+    return made_of("doses", HYPOTHESES, by_dose(judged, offered))
 
 
 def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:

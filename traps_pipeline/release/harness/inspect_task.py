@@ -18,7 +18,7 @@ from inspect_ai.model import (
 from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
-from traps_pipeline.release.harness.items import about, items, media_of, prompt
+from traps_pipeline.release.harness.harness_items import about, items, media_of, prompt
 from traps_pipeline.release.harness.scoring import Judged, figures, judge
 
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}

@@ -11,7 +11,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
 
-from traps_pipeline.release.harness.items import media_of, prompt
+from traps_pipeline.release.harness.harness_items import media_of, prompt
 from traps_pipeline.release.harness.scoring import Judged, figures, judge
 
 

@@ -17,29 +17,23 @@ from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.judges import RULES_PANEL, panel_id
 from traps_pipeline.models.registry import PROTOCOL
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.protocol.metrics import METRIC_WORDS
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
-from traps_pipeline.release.harness.items import ABOUT, ITEMS, MEDIA
+from traps_pipeline.release.harness.harness_items import ABOUT, ITEMS, MEDIA
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
 
 PACKAGE, LMMS = "traps_harness", "lmms"
 _CODE = Path(__file__).parents[2]
-# Modules that are copied, by their name in the package of the harness. They import each other and the standard library.
-_COPIED = {
-    "base/digests.py": "digests.py",
-    "models/request.py": "request.py",
-    "models/endings.py": "endings.py",
-    "models/thinking.py": "thinking.py",
-    "models/reading.py": "reading.py",
-    "judging/judged_answers.py": "answers.py",
-    "judging/rules.py": "rules.py",
-    "release/harness/scoring.py": "scoring.py",
-    "release/harness/items.py": "items.py",
-    "release/harness/inspect_task.py": "inspect_task.py",
-}
+# Modules that are copied under their own names. They import each other and the standard library.
+_COPIED = (
+    *("base/digests.py", "base/redaction.py", "protocol/regimes.py"),
+    *("models/request.py", "models/endings.py", "models/thinking.py", "models/reading.py"),
+    *("judging/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
+    *("release/harness/harness_items.py", "release/harness/inspect_task.py"),
+)
 _IMPORT = re.compile(r"(?m)^( *)from traps_pipeline\.([\w.]+) import ")
 _SHOWN = ("item_id", "dataset", "side", "question", "labels", "aliases", "answer_type", "ground_truth", "canary")
 SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
@@ -86,8 +80,8 @@ def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"
         "items": digest(sorted(items)),
     }
     write_text(package / ABOUT, json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-    for source, name in _COPIED.items():
-        write_text(package / name, copied((_CODE / source).read_text(encoding="utf-8")))
+    for source in _COPIED:
+        write_text(package / Path(source).name, copied((_CODE / source).read_text(encoding="utf-8")))
     write_text(package / "__init__.py", f'"""The items, panel and metric of {manifest["name"]}."""\n')
     write_text(target / "traps_task.py", _TASK)
     write_text(target / "pyproject.toml", _PYPROJECT.format(version=manifest["version"].partition("+")[0]))

@@ -26,7 +26,7 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.report.explorer.answers import StudyAnswers, study_answers
+from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
 from traps_pipeline.report.explorer.scripts import data_script, parquet_text
 from traps_pipeline.report.leaderboard_page import legend, provenance

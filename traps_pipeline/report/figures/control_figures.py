@@ -13,9 +13,9 @@ from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.control_reports import beside
+from traps_pipeline.report.tables.inside_columns import few, why
 from traps_pipeline.report.tables.patching_tables import SITES
 from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
-from traps_pipeline.report.tables.steering_tables import few, why
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
     COLOURS,
@@ -100,8 +100,7 @@ def gate_arrows(results: Results) -> Figure:
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     rows = rows.loc[rows["features"].isin(_FEATURES)]
     if not len(rows):
-        absent = why(results) if results.is_study else "the paper gates nothing"
-        raise NotRun(absent)
+        raise NotRun(why(results, "the paper gates nothing"))
     from matplotlib.lines import Line2D
 
     regimes = [name for name in PROMPTING if name in set(rows["regime"])]
@@ -227,8 +226,7 @@ def doses_among_nulls(results: Results) -> Figure:
     much, the direction itself counted with them; on controls, then on voids."""
     rows = results.own_effects
     if not len(rows):
-        absent = why(results) if results.is_study else "the paper has no such nulls"
-        raise NotRun(absent)
+        raise NotRun(why(results, "the paper has no such nulls"))
     from matplotlib.lines import Line2D
 
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))

@@ -10,7 +10,7 @@ from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING, STANDARD
 from traps_pipeline.report.result_frames import Results, datasets_of
-from traps_pipeline.report.tables.steering_tables import why
+from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, NotRun, figure_style, new_figure, plain
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ def states_and_output(results: Results) -> Figure:
     (mean and two deviations). A gap is one of orders too only where states are above the output by more than that."""
     rows = scored_items(results)
     if not len(rows):
-        absent = why(results) if results.is_study else "the paper prints no scores of items"
-        raise NotRun(absent)
+        raise NotRun(why(results, "the paper prints no scores of items"))
     from matplotlib.lines import Line2D
 
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
@@ -103,8 +102,7 @@ def lens(results: Results) -> Figure:
     decides; at the last layer they are the output. The dotted line is even odds."""
     rows = results.lens
     if not len(rows):
-        absent = why(results) if results.is_study else "the paper has no such curves"
-        raise NotRun(absent)
+        raise NotRun(why(results, "the paper has no such curves"))
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator
 

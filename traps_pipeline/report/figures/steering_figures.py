@@ -13,8 +13,8 @@ from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, T
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.report.figures.looks import from_to
 from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.probe_tables import best_layers
-from traps_pipeline.report.tables.steering_tables import why
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 

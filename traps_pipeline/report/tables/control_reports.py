@@ -5,21 +5,31 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.transfer_paths import path_name, probed_taxonomy
+from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.probe_baselines import SHORTCUTS, against
-from traps_pipeline.report.tables.steering_tables import DIRECTIONS, FEW, INFERENCE, few, why
+from traps_pipeline.report.tables.inside_columns import (
+    DIRECTIONS,
+    DRAWS,
+    INFERENCE,
+    LAYER,
+    PATH,
+    SIDES,
+    few,
+    few_note,
+    interval,
+    path_names,
+    short_names,
+    why,
+)
+from traps_pipeline.report.tables.probe_baselines import AT, SHORTCUTS, against, by_features, other_probes
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FEW_NOTE = f"† fewer than {FEW} controls or voids: the value says little"
-DRAWS = "± standard deviation over draws of noise"
-LAYER = Column("layer", "Layer", "count")
 DOSE = Column("step", "Dose")
 SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
 
@@ -62,34 +72,18 @@ def look_alikes(results: Results) -> pd.DataFrame:
 
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
-    import pandas as pd
-
-    keys = ["model", "prompt", "analysis", "source", "target"]
-    rows = results.baselines
-    probe = (probe if len(rows) else probe.head(0)).astype({"prompt": object})
-    wide = rows.pivot_table(index=keys, columns="features", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise", *other_probes(results)])).reset_index()
-    noise = rows.loc[rows["features"] == "noise", [*keys, "spread"]].rename(columns={"spread": "noise_spread"})
-    kept = probe[[*keys, "layer", "value", "low", "high", "n_voids", "n_controls"]]
-    table = kept.merge(wide, on=keys, how="left").merge(noise, on=keys, how="left")
+    probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
+    kept = probe[[*AT, "layer", "value", "low", "high", "n_voids", "n_controls"]]
+    table = kept.merge(by_features(results), on=AT, how="left")
     return table.assign(mark=few(table, "n_voids", "n_controls"))
 
 
-def other_probes(results: Results) -> list[str]:
-    """The further probes of the states that experiments name, as features of `probe_baselines`."""
-    return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
-
-
-_PROBE = (
-    Column("layer", "Layer", "count"), Column("value", "States", "fraction", mark="mark"),
-    Column("low", "from", "fraction"), Column("high", "to", "fraction"),
-)  # fmt: skip
+_PROBE = (LAYER, Column("value", "States", "fraction", mark="mark"), *interval())
 _BASELINES = (
     *(Column(name, name.capitalize(), "fraction") for name in SHORTCUTS),
     Column("output margin", "Output margin", "fraction"),
     Column("noise", "Noise", "fraction", spread="noise_spread"),
 )
-_SIDES = (Column("n_voids", "Voids", "count"), Column("n_controls", "Controls", "count"))
 _NOTES = (
     "AUROC of the same protocol on other features than states; the layer is chosen on pairs of other datasets than "
     "the target (probe_layers)",
@@ -102,15 +96,15 @@ _NOTES = (
 
 def _beside(results: Results) -> PrintedTable:
     rows = beside(results)
-    rows = rows.assign(path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)])
+    rows = rows.assign(path=path_names(rows))
     others = [Column(name, name.capitalize(), "fraction") for name in other_probes(results)]
-    columns = [MODEL, Column("path", "Path"), *_PROBE, *others, *_BASELINES, *_SIDES]
+    columns = [MODEL, PATH, *_PROBE, *others, *_BASELINES, *SIDES]
     notes = [
         *_NOTES,
         "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
-        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+        *few_note(rows),
     ]
-    absent = why(results) if results.is_study else "the paper has no such baselines"
+    absent = why(results, "the paper has no such baselines")
     title = "Probes beside their baselines"
     return PrintedTable("probe_baselines", title, rows, columns, notes, absent, deviation=DRAWS)
 
@@ -120,20 +114,20 @@ def _look_alikes(results: Results) -> PrintedTable:
     named = rows.assign(
         what=[WHAT[name] for name in rows["target"]],
         against=[AGAINST[name] for name in rows["analysis"]],
-        path=[SHORT.get(name, name) for name in rows["source"]],
+        path=short_names(rows["source"]),
     )
     columns = [
         MODEL, Column("what", "Items"), Column("against", "Told apart from"), Column("path", "Source"), *_PROBE,
-        *_BASELINES, *_SIDES,
+        *_BASELINES, *SIDES,
     ]  # fmt: skip
     notes = [
         *_NOTES[:2],
         "told apart from voids: 1 for a probe that detects what cannot be known, 0.5 for one that detects what both "
         "have; from controls: the reverse",
         "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
-        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+        *few_note(rows),
     ]
-    absent = why(results) if results.is_study else "the paper has no such items"
+    absent = why(results, "the paper has no such items")
     title = "What only looks like a void"
     return PrintedTable("probe_look_alikes", title, named, columns, notes, absent, deviation=DRAWS)
 
@@ -157,9 +151,7 @@ def _dose(rows: pd.DataFrame) -> list[str]:
 
 def _nulls(results: Results) -> PrintedTable:
     rows = results.nulls
-    named = rows.assign(
-        step=_dose(rows), dataset=[SHORT.get(name, name) for name in rows["target"]], mark=few(rows, "n")
-    )
+    named = rows.assign(step=_dose(rows), dataset=short_names(rows["target"]), mark=few(rows, "n"))
     columns = [
         MODEL, DIRECTIONS, INFERENCE, Column("dataset", "Dataset"), LAYER, DOSE, Column("side", "Side"),
         Column("null", "Null"), Column("effect", "Effect, points", "percent", mark="mark"),
@@ -172,9 +164,9 @@ def _nulls(results: Results) -> PrintedTable:
         "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
         "(1 + draws), one-sided, not corrected for the number of rows",
         *_ahead(rows),
-        *([FEW_NOTE] if "†" in set(named["mark"]) else []),
+        *few_note(named),
     ]
-    absent = why(results) if results.is_study else "the paper has no such nulls"
+    absent = why(results, "the paper has no such nulls")
     return PrintedTable("steering_nulls", "Void directions among their nulls", named, columns, notes, absent)
 
 
@@ -202,11 +194,11 @@ def _pecs(results: Results) -> PrintedTable:
     named = rows.assign(
         step=_dose(rows),
         policy=[SIGNS[name] if dose else "not steered" for name, dose in zip(rows["signs"], rows["dose"], strict=True)],
-        path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)],
+        path=path_names(rows),
         mark=few(rows, "n_controls", "n_voids"),
     )
     columns = [
-        MODEL, DIRECTIONS, INFERENCE, Column("path", "Path"), LAYER, Column("policy", "Signs"), DOSE,
+        MODEL, DIRECTIONS, INFERENCE, PATH, LAYER, Column("policy", "Signs"), DOSE,
         Column("acc", "Acc %", "percent"), Column("false_abs", "FalseAbs %", "percent"),
         Column("abs_rec", "AbsRec %", "percent"), Column("j", "J", "fraction"),
         Column("pecs", "PECS", "fraction", mark="mark"), Column("degenerate", "Degenerate %", "percent"),
@@ -216,9 +208,9 @@ def _pecs(results: Results) -> PrintedTable:
         "each dataset along its own direction; + on controls and − on voids needs the side of each item, which nobody "
         "has who uses a model",
         "degenerate: cut off, a phrase four times in a row, or another script or language than the unsteered answer",
-        *([FEW_NOTE] if "†" in set(named["mark"]) else []),
+        *few_note(named),
     ]
-    absent = why(results) if results.is_study else "the paper prints no correctness of steered answers"
+    absent = why(results, "the paper prints no correctness of steered answers")
     return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
 
 
@@ -236,9 +228,9 @@ def gate(results: Results) -> list[PrintedTable]:
 
 _GATED = (
     Column("plain_pecs", "PECS, plain", "fraction"), Column("pecs", "PECS, gated", "fraction", mark="mark"),
-    Column("pecs_low", "from", "fraction"), Column("pecs_high", "to", "fraction"),
+    *interval("pecs_"),
     Column("acc", "Acc %", "percent"), Column("abs_rec", "AbsRec %", "percent"),
-    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"), *_SIDES,
+    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"), *SIDES,
 )  # fmt: skip
 _GATE_NOTES = (
     "a gated answer becomes an abstention and every other answer keeps its verdict; no gate has seen the scenario that "
@@ -257,7 +249,7 @@ def _gates(results: Results) -> pd.DataFrame:
     return rows.assign(
         mark=few(rows, "n_controls", "n_voids"),
         layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
-        dataset=[SHORT.get(name, name) for name in rows["target"]],
+        dataset=short_names(rows["target"]),
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
     ).drop(columns=[*later])
 
@@ -273,9 +265,9 @@ def _gate_sources(results: Results) -> PrintedTable:
         *_GATE_NOTES,
         "mid: half-way between the means of the sides; J: the cut with the largest J on unseen source items; "
         "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
-        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+        *few_note(rows),
     ]
-    absent = why(results) if results.is_study else "the paper gates nothing"
+    absent = why(results, "the paper gates nothing")
     return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, absent)
 
 
@@ -288,9 +280,9 @@ def _gate_controls(results: Results) -> PrintedTable:
         "gates from other datasets at the mid threshold, mean over the four datasets",
         "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
         "and on an untrained model’s states",
-        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+        *few_note(rows),
     ]
-    absent = why(results) if results.is_study else "the paper gates nothing"
+    absent = why(results, "the paper gates nothing")
     return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
 
 
@@ -307,9 +299,9 @@ def _gate_answerable(results: Results) -> PrintedTable:
     ]  # fmt: skip
     notes = [
         "all of these items can be answered, so that every abstention of a gate is a false one",
-        *([FEW_NOTE.replace("controls or voids", "items")] if "†" in set(rows["mark"]) else []),
+        *few_note(rows, of="items"),
     ]
-    absent = why(results) if results.is_study else "the paper gates nothing"
+    absent = why(results, "the paper gates nothing")
     return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
 
 
@@ -338,7 +330,7 @@ def prompts(results: Results) -> pd.DataFrame:
             counted |= {count: (rows, count) for count in ("n_voids", "n_controls")}
     for name, (rows, count) in counted.items():
         table[name] = rows.groupby(keys)[count].min().reindex(table.index)
-    floor = against(results, "held_out")
+    floor = against(results, "held_out").reset_index()
     floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
     return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
 
@@ -346,7 +338,7 @@ def prompts(results: Results) -> pd.DataFrame:
 def _prompts(results: Results) -> PrintedTable:
     rows = prompts(results)
     rows = rows.assign(
-        name=[SHORT.get(name, name) for name in rows["dataset"]],
+        name=short_names(rows["dataset"]),
         said_mark=few(rows, "n_answered"),
         probe_mark=few(rows, "n_voids", "n_controls"),
     )
@@ -358,15 +350,15 @@ def _prompts(results: Results) -> PrintedTable:
           for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTING),
         Column("raw", "Best raw input"), Column("raw_value", "its AUROC", "fraction"),
         Column("noise", "Noise", "fraction", spread="noise_spread"),
-        Column("n_answered", "Voids answered about", "count"), *_SIDES,
+        Column("n_answered", "Voids answered about", "count"), *SIDES,
     ]  # fmt: skip
     notes = [
         "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
         "states under the VQA prompt of that name, fitted without the scored scenario); the best raw input and noise "
         "are the same under both prompts",
         _NOTES[1],
-        *([FEW_NOTE] if "†" in {*rows["said_mark"], *rows["probe_mark"]} else []),
+        *few_note(rows, "said_mark", "probe_mark"),
     ]
-    absent = why(results) if results.is_study else "the paper prints no such figures"
+    absent = why(results, "the paper prints no such figures")
     title = "What the prompt changes, in answers and in states"
     return PrintedTable("prompt_gate", title, rows, columns, notes, absent, deviation=DRAWS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.protocol.metrics import METRIC_WORDS, SHARES
+from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import DATASET, MODEL, REGIME, RUNS, ordered, titled
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, fraction, percent

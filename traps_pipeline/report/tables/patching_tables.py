@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.control_reports import FEW_NOTE, LAYER
-from traps_pipeline.report.tables.steering_tables import few
+from traps_pipeline.report.tables.inside_columns import LAYER, few, few_note, interval, short_names
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
@@ -25,7 +23,7 @@ def patching(results: Results) -> list[PrintedTable]:
         wide.reindex(columns=names).reset_index().astype(dict.fromkeys(keys, object)), on=keys, how="left"
     )
     table = table.assign(
-        name=[SHORT.get(name, name) for name in table["dataset"]],
+        name=short_names(table["dataset"]),
         where=[SITES.get(site, site) for site in table["site"]],
         place=[[*SITES].index(site) if site in SITES else len(SITES) for site in table["site"]],
         mark=few(table, "n"),
@@ -36,7 +34,7 @@ def patching(results: Results) -> list[PrintedTable]:
         Column("group", "Positions"),
         Column("tokens", "Tokens", "ratio"), Column("attributed", "Estimate", "fraction"),
         Column("effect", "Indirect effect", "fraction", mark="mark"),
-        Column("low", "from", "fraction"), Column("high", "to", "fraction"), Column("flips", "Flipped %", "percent"),
+        *interval(), Column("flips", "Flipped %", "percent"),
         Column("n_flippable", "of", "count"), *(Column(name, name.capitalize(), "fraction") for name in names),
         Column("n", "Pairs", "count"), Column("n_left_out", "Left out", "count"),
     ]  # fmt: skip
@@ -50,7 +48,7 @@ def patching(results: Results) -> list[PrintedTable]:
         "with the other side’s times, in the residual stream alone",
         "estimate: of the indirect effect, to first order, from one backward pass a pair; the rows are those cells of "
         "site, layer and positions whose estimates are largest",
-        *([FEW_NOTE.replace("controls or voids", "pairs")] if "†" in set(table["mark"]) else []),
+        *few_note(table, of="pairs"),
     ]
     absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
     return [PrintedTable("patching", "Activation patching", table, columns, notes, absent)]

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stamps")
 KEYS = ["model", "source", "target"]
+AT = ["model", "prompt", "analysis", "source", "target"]
 NO_RAW = "none above .5"
 BESIDE = ("raw", "raw_value", "margin", "noise", "noise_spread")
 NOTES = (
@@ -25,27 +26,34 @@ NOTES = (
 )
 
 
-def against(results: Results, analysis: str, prefix: str = "") -> pd.DataFrame:
-    """One row per model, source and target: the best raw input (its name, its AUROC), the output margin and noise under
-    an analysis of `probe_baselines`, as BESIDE with a prefix."""
+def by_features(results: Results) -> pd.DataFrame:
+    """One row per model, prompt, analysis, source and target of `probe_baselines`: the value of each of its features,
+    and noise_spread."""
     import pandas as pd
 
     rows = results.baselines
-    rows = rows.loc[rows["analysis"] == analysis].astype(dict.fromkeys(KEYS, object))
-    wide = rows.pivot_table(index=KEYS, columns="features", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"]))
-    raw = wide[[*SHORTCUTS]].astype(float)
-    table = pd.DataFrame(
-        {
-            "raw": [best_name(row) for row in raw.to_dict("records")],
-            "raw_value": raw.max(axis=1),
-            "margin": wide["output margin"],
-            "noise": wide["noise"],
-        },
-        index=wide.index,
-    )
-    spread = rows.loc[rows["features"] == "noise"].set_index(KEYS)["spread"]
-    return table.join(spread.rename("noise_spread")).add_prefix(prefix).reset_index()
+    wide = rows.pivot_table(index=AT, columns="features", values="value", observed=True)
+    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise", *other_probes(results)]))
+    spread = rows.loc[rows["features"] == "noise"].set_index(AT)["spread"]
+    return wide.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(AT, object))
+
+
+def other_probes(results: Results) -> list[str]:
+    """The further probes of the states that experiments name, as features of `probe_baselines`."""
+    return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
+
+
+def against(results: Results, analysis: str) -> pd.DataFrame:
+    """BESIDE of each model, source and target under an analysis: the best raw input (its name, its AUROC), the output
+    margin and noise."""
+    import pandas as pd
+
+    rows = by_features(results)
+    rows = rows.loc[rows["analysis"] == analysis].set_index(KEYS)
+    raw = rows[[*SHORTCUTS]].astype(float)
+    best = [best_name(row) for row in raw.to_dict("records")]
+    own = rows[["output margin", "noise", "noise_spread"]].rename(columns={"output margin": "margin"})
+    return pd.DataFrame({"raw": best, "raw_value": raw.max(axis=1)}, index=rows.index).join(own)
 
 
 def best_name(values: Mapping[Any, float]) -> str:

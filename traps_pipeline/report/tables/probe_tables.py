@@ -4,7 +4,7 @@ the raw inputs, the output margin and the floor of noise."""
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,13 +13,24 @@ from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.protocol.datasets import SHORT, transfer_type
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables import probe_baselines
-from traps_pipeline.report.tables.control_reports import DRAWS, FEW_NOTE
-from traps_pipeline.report.tables.steering_tables import PATH, TYPE, few, short_names, why
+from traps_pipeline.report.tables.inside_columns import (
+    DRAWS,
+    LAYER,
+    PATH,
+    SIDES,
+    TYPE,
+    few,
+    few_note,
+    interval,
+    short_names,
+    why,
+)
+from traps_pipeline.report.tables.probe_baselines import KEYS
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator
 
     import pandas as pd
 
@@ -27,78 +38,91 @@ if TYPE_CHECKING:
 def probes(results: Results) -> list[PrintedTable]:
     """Probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
     layer that is chosen without the target's labels."""
-    tables = [_transfer(results), _confabulated(results), _means(results), _within(results)]
+    pairs = _pairs(results)
+    tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
     return [*tables, _layers(results), _catch(results)]
 
 
 APART = "not computed; held out: these datasets share no controls and no scenarios"
 
-
-def _few_note(marks: Sequence[str]) -> list[str]:
-    return [FEW_NOTE] if "†" in set(marks) else []
-
-
 # --- transfer ---------------------------------------------------------------------------------------------------------
+
+
+class At(NamedTuple):
+    """Which row of PROBES a pair's figure is: of this analysis, at the layer that has this flag; and its columns."""
+
+    analysis: str
+    flag: str
+    columns: tuple[str, ...] = ("value",)
+
+
+_LAYER_AND_VALUE = ("layer", "value", "low", "high")
+# The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
+FIGURES = {
+    "best": At("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
+    "chosen": At("transfer", "chosen", _LAYER_AND_VALUE),
+    "held_out": At("held_out", "all_sample_best"),
+    "cf": At("confabulated", "all_sample_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
+    "cf_own": At("confabulated", "own_best", ("layer", "value")),
+    "cf_held_out": At("confabulated_held_out", "all_sample_best"),
+}
+# The analyses whose baselines stand beside a pair's figures, by the prefix of their columns.
+BASELINES = {
+    "": "transfer",
+    "cf_": "confabulated",
+    "held_": "held_out",
+    "cf_held_": "confabulated_held_out",
+}
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     """One row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target, and
-    Cf->Cf at its own and at the best layer."""
+    Cf->Cf at its own and at the best layer, as FIGURES."""
     import pandas as pd
 
-    pair_rows: list[dict[str, Any]] = []
-    analyses = ("transfer", "held_out", "confabulated", "confabulated_held_out")
-    for model, of in rows.groupby("model", sort=False):
-        for source, target in TRANSFER_PAIRS:
-            pair = of.loc[(of["source"] == source) & (of["target"] == target)]
-            transfer, held_out, cf, cf_held_out = (pair.loc[pair["analysis"] == name] for name in analyses)
-            if not len(transfer):
-                continue
-            best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["chosen"]]
-            at_best, own = cf.loc[cf["all_sample_best"] & cf["value"].notna()], cf.loc[cf["own_best"]]
-            pair_rows.append(
-                {
-                    **{"model": model, "source": source, "target": target, "path": path_name(source, target)},
-                    "transfer_type": transfer_type(source, target),
-                    **_at(best, "best", ("layer", "value", "low", "high", "n_voids", "n_controls")),
-                    **_at(chosen, "chosen", ("layer", "value", "low", "high")),
-                    **_at(held_out.loc[held_out["all_sample_best"]], "held_out", ("value",)),
-                    **_at(at_best, "cf", ("layer", "value", "low", "high", "n_voids", "n_controls")),
-                    **_at(own, "cf_own", ("layer", "value")),
-                    **_at(cf_held_out.loc[cf_held_out["all_sample_best"]], "cf_held_out", ("value",)),
-                    "note": next(iter([*cf["note"].dropna(), *cf_held_out["note"].dropna()]), ""),
-                }
-            )
-    return pd.DataFrame(pair_rows)
+    def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
+        found = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
+        return {tuple(row[key] for key in KEYS): row for row in found.to_dict("records")}  # pyright: ignore[reportReturnType]
 
-
-def _at(rows: pd.DataFrame, name: str, fields: tuple[str, ...]) -> dict[str, Any]:
-    return {f"{name}_{field}": rows[field].iloc[0] if len(rows) else np.nan for field in fields}
+    asked = by_pair("transfer", rows["model"].notna())
+    known = rows["value"].notna()
+    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in FIGURES.items()}
+    notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
+    table = [
+        dict(zip(KEYS, key, strict=True))
+        | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
+        | {f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan) for name, at in FIGURES.items() for c in at.columns}
+        | {"note": next((of[key]["note"] for of in notes if key in of), "")}
+        for model in rows["model"].unique()
+        for key in ((str(model), *pair) for pair in TRANSFER_PAIRS)
+        if key in asked
+    ]
+    return pd.DataFrame(table)
 
 
 def _pairs(results: Results) -> pd.DataFrame:
-    """`best_layers` with what stands beside transfer, and with the prefix cf_ beside Cf->Cf."""
+    """`best_layers` with BASELINES beside its figures, and marks."""
     rows = best_layers(results.probes)
     if not len(rows):
         return rows
-    for analysis, prefix in (
-        ("transfer", ""), ("confabulated", "cf_"), ("held_out", "held_"), ("confabulated_held_out", "cf_held_"),
-    ):  # fmt: skip
-        rows = rows.merge(probe_baselines.against(results, analysis, prefix), on=probe_baselines.KEYS, how="left")
+    for prefix, analysis in BASELINES.items():
+        rows = rows.join(probe_baselines.against(results, analysis).add_prefix(prefix), on=KEYS)
+    return _marked(rows)
+
+
+def _marked(rows: pd.DataFrame) -> pd.DataFrame:
     marks = {"mark": few(rows, "best_n_voids", "best_n_controls"), "cf_mark": few(rows, "cf_n_voids", "cf_n_controls")}
     return rows.assign(**marks)
 
 
-def _transfer(results: Results) -> PrintedTable:
-    rows = _pairs(results)
+def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
     cf = [
         Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_layer", "Cf’s own layer", "count"),
         Column("cf_own_value", "Cf→Cf there", "fraction"),
     ]  # fmt: skip
     columns = [
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"),
-        Column("best_value", "AUROC", "fraction", mark="mark"),
-        Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
+        Column("best_value", "AUROC", "fraction", mark="mark"), *interval("best_"),
         Column("chosen_layer", "Chosen layer", "count"), Column("chosen_value", "AUROC there", "fraction"),
         *_held_out(results), *probe_baselines.columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
@@ -109,22 +133,18 @@ def _transfer(results: Results) -> PrintedTable:
         *_shared_controls(results),
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
         *probe_baselines.notes(results),
-        *_few_note([] if not len(rows) else rows["mark"].tolist()),
+        *few_note(rows),
     ]
     title = "Probe transfer: AUROC by ordered pair"
     return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
 
 
-def _confabulated(results: Results) -> PrintedTable:
-    rows = _pairs(results)
-    silent: list[str] = []
-    if len(rows):
-        silent = sorted({note for note in rows["note"] if note})
-        rows = rows.loc[rows["cf_value"].notna()].reset_index(drop=True)
+def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
+    rows = pairs.loc[pairs["cf_value"].notna()].reset_index(drop=True) if len(pairs) else pairs
+    silent = sorted({note for note in pairs["note"] if note}) if len(pairs) else []
     columns = [
         MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
-        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), Column("cf_low", "from", "fraction"),
-        Column("cf_high", "to", "fraction"), *_held_out(results, "cf_"),
+        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out(results, "cf_"),
         Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
         *probe_baselines.columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
         Column("cf_n_controls", "Controls", "count"),
@@ -135,9 +155,9 @@ def _confabulated(results: Results) -> PrintedTable:
         *_shared_controls(results),
         *silent,
         *probe_baselines.notes(results),
-        *_few_note([] if not len(rows) else rows["cf_mark"].tolist()),
+        *few_note(rows, "cf_mark"),
     ]
-    absent = why(results) if results.is_study else "the paper has these figures in its table of probe transfer"
+    absent = why(results, "the paper has these figures in its table of probe transfer")
     if results.is_study and len(results.probes):
         absent = "; ".join(silent) or absent
     title = "Probes on confabulated voids (Cf→Cf)"
@@ -145,43 +165,35 @@ def _confabulated(results: Results) -> PrintedTable:
     return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=APART, deviation=DRAWS)
 
 
-def _means(results: Results) -> PrintedTable:
-    rows = _pairs(results)
+def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
-        figures = ["best_value", "chosen_value", "held_out_value", "cf_value", "cf_own_value", "cf_held_out_value"]
-        figures += [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures += ["held_noise", "cf_held_noise"]
-        grouped = rows.groupby(["model", "transfer_type"], sort=False)
-        means = {name: (name, "mean") for name in figures}
-        names = {f"{prefix}raw": (f"{prefix}raw", _listed) for prefix in ("", "cf_")}
-        sides = {name: (name, "min") for name in ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")}
-        rows = grouped.agg(**means, **names, **sides, n_paths=("path", "count")).reset_index()
-        rows = rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"))
-        rows = rows.assign(cf_mark=few(rows, "cf_n_voids", "cf_n_controls"))
+        beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
+        figures = [*(f"{name}_value" for name in FIGURES), *beside, "held_noise", "cf_held_noise"]
+        sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
+        by = {
+            **dict.fromkeys(figures, "mean"),
+            **dict.fromkeys(("raw", "cf_raw"), _listed),
+            **dict.fromkeys(sides, "min"),
+        }
+        groups = rows.groupby(["model", "transfer_type"], sort=False)
+        rows = _marked(groups.agg(by).assign(n_paths=groups.size()).reset_index())
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("chosen_value", "Chosen layer", "fraction", mark="mark"),
         *_held_out(results), *probe_baselines.columns(results),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
         Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
-        *probe_baselines.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"), *_fewest(results),
+        *probe_baselines.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
-    notes = [*_shared_controls(results), *probe_baselines.notes(results)]
-    notes += _few_note([] if not len(rows) else [*rows["mark"], *rows["cf_mark"]])
+    notes = [*_shared_controls(results), *probe_baselines.notes(results), *few_note(rows, "mark", "cf_mark")]
     if results.is_study:
+        columns += [
+            Column("best_n_voids", "Fewest voids", "count"), Column("best_n_controls", "Fewest controls", "count"),
+            Column("cf_n_voids", "Fewest Cf voids", "count"),
+        ]  # fmt: skip
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
     title = "Probe transfer: means over paths"
     return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
-
-
-def _fewest(results: Results) -> list[Column]:
-    """Items of a side in the path that has the fewest."""
-    if not results.is_study:
-        return []
-    return [
-        Column("best_n_voids", "Fewest voids", "count"), Column("best_n_controls", "Fewest controls", "count"),
-        Column("cf_n_voids", "Fewest Cf voids", "count"),
-    ]  # fmt: skip
 
 
 def _listed(names: pd.Series) -> str:
@@ -221,7 +233,7 @@ def _within(results: Results) -> PrintedTable:
     itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
     itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
     table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
-    table = table.merge(probe_baselines.against(results, "held_out"), on=probe_baselines.KEYS, how="left")
+    table = table.join(probe_baselines.against(results, "held_out"), on=KEYS)
     table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
@@ -231,16 +243,14 @@ def _within(results: Results) -> PrintedTable:
     notes = ["cross-validated, folds by scenario; shuffled: mean over shuffles and layers ± deviation over shuffles"]
     if results.is_study:
         columns += [
-            Column("pooled", "Over all folds", "fraction"), Column("low", "from", "fraction"),
-            Column("high", "to", "fraction"), *probe_baselines.columns(results), Column("n_voids", "Voids", "count"),
-            Column("n_controls", "Controls", "count"),
+            Column("pooled", "Over all folds", "fraction"), *interval(), *probe_baselines.columns(results), *SIDES,
         ]  # fmt: skip
         notes += [
             "AUROC: mean over folds; over all folds: of the scores of all folds together, with its 95 % interval from "
             "resampled scenarios; baselines are to be compared with it",
             *probe_baselines.NOTES,
         ]
-    notes += _few_note(table["mark"].tolist())
+    notes += few_note(table)
     title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
     return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=over)
 
@@ -256,10 +266,10 @@ def _catch(results: Results) -> PrintedTable:
     table = table.merge(_caught_beside(results), on=["model", "target", "sub_scenario"], how="left")
     table = table.assign(dataset=short_names(table["target"]), mark=few(table, "n", "n_controls"))
     columns = [
-        MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), Column("layer", "Layer", "count"),
+        MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), LAYER,
         Column("rate", "Catch rate %", "percent", mark="mark"), Column("lowest", "lowest", "percent"),
         Column("highest", "highest", "percent"), Column("false_alarm", "Controls %", "percent"),
-        *(_CAUGHT if results.is_study else ()), Column("n", "n", "count"),
+        *(_caught_columns() if results.is_study else ()), Column("n", "n", "count"),
     ]  # fmt: skip
     notes = ["voids that the source’s nearest centroid assigns to void, mean over the other datasets as sources"]
     if results.is_study:
@@ -269,16 +279,16 @@ def _catch(results: Results) -> PrintedTable:
             "best raw input: the one whose catch rate is farthest above its share of controls; controls % to the right "
             "of a baseline are its own",
         ]
-    notes += _few_note(table["mark"].tolist())
+    notes += few_note(table)
     return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why(results))
 
 
-_CAUGHT = (
-    Column("raw", "Best raw input"), Column("raw_void", "catches %", "percent"),
-    Column("raw_control", "its controls %", "percent"), Column("margin_void", "Output margin %", "percent"),
-    Column("margin_control", "its controls %", "percent"), Column("noise_void", "Noise %", "percent"),
-    Column("noise_control", "its controls %", "percent"),
-)  # fmt: skip
+def _caught_columns() -> Iterator[Column]:
+    """What each kind of baseline catches, and its share of controls."""
+    yield Column("raw", "Best raw input")
+    for name, heading in (("raw", "catches %"), ("margin", "Output margin %"), ("noise", "Noise %")):
+        yield Column(f"{name}_void", heading, "percent")
+        yield Column(f"{name}_control", "its controls %", "percent")
 
 
 def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
@@ -297,23 +307,23 @@ def _caught_beside(results: Results) -> pd.DataFrame:
     rows = _centroids(results.baselines).astype(dict.fromkeys(("model", "features", "analysis"), object))
     wide = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
     wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
-    wide = wide.assign(above=wide["centroid_void"] - wide["centroid_control"])
-    raw = wide.loc[wide["features"].isin(probe_baselines.SHORTCUTS)].sort_values(
-        "above", ascending=False, kind="stable"
-    )
-    kinds = {"raw": raw.drop_duplicates(keys), "margin": wide.loc[wide["features"] == "output margin"]}
-    kinds["noise"] = wide.loc[wide["features"] == "noise"]
-    table = kinds["raw"].rename(columns={"features": "raw"})[[*keys, "raw"]]
+    wide.columns = pd.Index([*keys, "features", "void", "control"])
+    order = wide.assign(above=wide["void"] - wide["control"]).sort_values("above", ascending=False, kind="stable")
+    raw = order.loc[order["features"].isin(probe_baselines.SHORTCUTS)].drop_duplicates(keys).set_index(keys)
+    table = raw[["features"]].rename(columns={"features": "raw"})
+    kinds = {"raw": raw} | {
+        name: wide.loc[wide["features"] == features].set_index(keys)
+        for name, features in (("margin", "output margin"), ("noise", "noise"))
+    }
     for name, part in kinds.items():
-        both = part.rename(columns={"centroid_void": f"{name}_void", "centroid_control": f"{name}_control"})
-        table = table.merge(both[[*keys, f"{name}_void", f"{name}_control"]], on=keys, how="outer")
-    return table
+        table = table.join(part[["void", "control"]].add_prefix(f"{name}_"), how="outer")
+    return table.reset_index()
 
 
 def _layers(results: Results) -> PrintedTable:
     table, notes = layer_curves(results.probes)
     columns = [
-        MODEL, Column("layer", "Layer", "count"),
+        MODEL, LAYER,
         *(Column(name, f"without {short}", "fraction", mark=f"{name}_mark") for name, short in SHORT.items()
           if name in table),
         Column("n_at_top", "Own maxima", "count"),
@@ -325,7 +335,7 @@ def _layers(results: Results) -> PrintedTable:
         "chooses none of them",
         *notes,
     ]
-    absent = why(results) if results.is_study else "the paper prints no curves"
+    absent = why(results, "the paper prints no curves")
     return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, absent)
 
 

@@ -2,43 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
-from traps_pipeline.mechanism.transfer_paths import path_name
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.inside_columns import (
+    ALPHA,
+    DIRECTIONS,
+    FEW,
+    FEW_MARK,
+    INFERENCE,
+    LAYER,
+    PATH,
+    TYPE,
+    few,
+    interval,
+    path_names,
+    short_names,
+    why,
+)
 from traps_pipeline.report.tables.table_columns import MODEL, epochs, rightly_empty
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
-PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
-DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
 KIND, SET = Column("kind", "Direction"), Column("path_set", "Path set")
-NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's states were read"
-FEW = 10  # items of a side, or answers of a cell, below which a value is marked
-CELLS_NOTE = f"† and means of such cells: fewer than {FEW} answers in a cell, whose share says little"
+CELLS_NOTE = f"{FEW_MARK} and means of such cells: fewer than {FEW} answers in a cell, whose share says little"
 SETS = {"transfer": "transfer", "within_domain": "within domain"}
-
-
-def why(results: Results) -> str:
-    """The reason why a frame of what is found inside models has no rows."""
-    return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
-
-
-def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """The mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
-    import pandas as pd
-
-    numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
-    return ["†" if any(value < FEW for value in values) else "" for values in zip(*numbers, strict=True)]
 
 
 # --- directions -------------------------------------------------------------------------------------------------------
@@ -59,9 +55,9 @@ def cosines(results: Results) -> list[PrintedTable]:
     rows = rows.merge(halves, on=["model", "other_prompt", "other_dataset"], how="left")
     rows = rows.assign(name=_named_directions(rows, ""), other=_named_directions(rows, "other_"))
     columns = [
-        MODEL, Column("layer", "Layer", "count"), Column("name", "Direction"), Column("other", "Other"),
+        MODEL, LAYER, Column("name", "Direction"), Column("other", "Other"),
         Column("cosine", "Cosine", "fraction", 2), Column("disattenuated", "Disattenuated", "fraction", 2),
-        Column("low", "from", "fraction", 2), Column("high", "to", "fraction", 2),
+        *interval(digits=2),
         Column("split_half", "Split half", "fraction", 2), Column("other_split_half", "of the other", "fraction", 2),
     ]  # fmt: skip
     notes = [
@@ -113,18 +109,18 @@ def _shares(results: Results) -> PrintedTable:
     ]
     wide = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
     wide = wide.sort_values(keys, key=_place, ignore_index=True)
-    columns = [MODEL, KIND, Column("layer", "Layer", "count"), Column("alpha", "α", "count")]
+    columns = [MODEL, KIND, LAYER, ALPHA]
     for side in ("control", "void"):
         columns += [
             Column(f"{side}_abstention", f"{side.capitalize()}s abstained on %", "percent"),
-            Column(f"{side}_low", "from", "percent"), Column(f"{side}_high", "to", "percent"),
+            *interval(f"{side}_", "percent"),
             Column(f"{side}_n_answers", "Answers", "count"), Column(f"{side}_n_scenarios", "Scenarios", "count"),
         ]  # fmt: skip
     notes = [
         "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
         "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
     ]
-    absent = why(results) if results.is_study else "the paper prints no answers to resample"
+    absent = why(results, "the paper prints no answers to resample")
     return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, absent)
 
 
@@ -133,7 +129,7 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
     rows = rows.assign(path_set=rows["path_set"].replace(SETS))
     columns = [
         MODEL, SET, *([Column("family", "Family")] if name.endswith("families") else [DIRECTIONS, INFERENCE]), KIND,
-        Column("alpha", "α", "count"), Column("control_0", "Control, α 0, %", "percent"),
+        ALPHA, Column("control_0", "Control, α 0, %", "percent"),
         Column("control_top", "Control, α, %", "percent"), Column("void_0", "Void, α 0, %", "percent"),
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
@@ -148,7 +144,7 @@ def _domains(results: Results) -> PrintedTable:
     rows = results.steering_domains
     rows = rows.assign(path=short_names(rows["source"]))
     columns = [
-        MODEL, DIRECTIONS, INFERENCE, Column("path", "Direction"), Column("alpha", "α", "count"),
+        MODEL, DIRECTIONS, INFERENCE, Column("path", "Direction"), ALPHA,
         Column("same", "Same domain, controls %", "percent"),
         Column("cross", "Cross domain, controls %", "percent"),
     ]  # fmt: skip
@@ -166,21 +162,19 @@ def _top(results: Results) -> PrintedTable:
     rows = effects.paths(results.effects)
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _named(rows)
-    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_in_gaps(results)]
+    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results)]
     columns += [*_SIDES, *_counts(results)]
     return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
 
 
 def _dose(results: Results) -> PrintedTable:
     rows = _named(effects.paths(results.effects))
-    columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, Column("layer", "Layer", "count")]
-    columns += [Column("alpha", "α", "count"), *_in_gaps(results)]
+    columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, LAYER]
+    columns += [ALPHA, *_in_gaps(results)]
     for side in _SIDES:
         columns += [side]
         if results.is_study:
-            columns += [
-                Column(f"{side.field}_{end}", word, "percent") for end, word in (("low", "from"), ("high", "to"))
-            ]
+            columns += interval(f"{side.field}_", "percent")
     columns += _counts(results)
     notes = [
         epochs(results.effects),
@@ -193,7 +187,7 @@ def _dose(results: Results) -> PrintedTable:
 def _layers(results: Results) -> PrintedTable:
     rows = results.steering_layers
     columns = [
-        MODEL, DIRECTIONS, INFERENCE, Column("layer", "Layer", "count"), Column("alpha", "α", "count"),
+        MODEL, DIRECTIONS, INFERENCE, LAYER, ALPHA,
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits", *_cell_notes(results)]
@@ -233,11 +227,5 @@ def _cell_notes(results: Results) -> list[str]:
 
 
 def _named(rows: pd.DataFrame) -> pd.DataFrame:
-    names = [path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)]
-    counted = {f"{side}_mark": f"{side}_n" for side in ("control", "void") if f"{side}_n" in rows}
-    return rows.assign(path=names, **{mark: few(rows, n) for mark, n in counted.items()}).reset_index(drop=True)
-
-
-def short_names(names: Iterable[str]) -> list[str]:
-    """The datasets' short names; `not stated` for one that is not known."""
-    return [SHORT.get(name, "not stated") for name in names]
+    marks = {f"{side}_mark": few(rows, f"{side}_n") for side in ("control", "void") if f"{side}_n" in rows}
+    return rows.assign(path=path_names(rows), **marks).reset_index(drop=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
-from traps_pipeline.protocol.metrics import METRIC_WORDS
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES

@@ -16,7 +16,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.dialects.postgresql import insert
 
-from traps_pipeline.cluster.database import Database
+from traps_pipeline.cluster.cluster_database import Database
 
 MANY = ("clips/", "media/")  # of which a process knows only what it has asked for: there may be millions
 FRESH_S = 0.5  # a look at the rows that is younger is not repeated

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace, print_json, whole
-from traps_pipeline.cli.submission import verify_file
+from traps_pipeline.cli.submission_commands import verify_file
 
 if TYPE_CHECKING:
     from traps_pipeline.release.commitment import Commitment

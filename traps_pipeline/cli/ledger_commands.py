@@ -54,7 +54,7 @@ def release(arguments: argparse.Namespace) -> int:
 
 def export(arguments: argparse.Namespace) -> int:
     """See `traps study export-ledger --help`."""
-    from traps_pipeline.ledger.transfer import export_ledger
+    from traps_pipeline.ledger.row_transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute())
     print(f"{count} rows are in {arguments.file}; `traps study import-ledger` reads them into another study")
@@ -63,7 +63,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 def import_(arguments: argparse.Namespace) -> int:
     """See `traps study import-ledger --help`."""
-    from traps_pipeline.ledger.transfer import import_ledger
+    from traps_pipeline.ledger.row_transfer import import_ledger
 
     workspace = open_workspace(arguments)
     count = import_ledger(arguments.file.absolute(), workspace.ledger)
@@ -74,7 +74,7 @@ def import_(arguments: argparse.Namespace) -> int:
 def move(arguments: argparse.Namespace) -> int:
     """See `traps study move --help`."""
     from traps_pipeline.base.progress import reporting
-    from traps_pipeline.cli.progress import make_progress
+    from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.storage.place import place_of
     from traps_pipeline.storage.store_move import move_to_store
     from traps_pipeline.storage.workspace import VARIABLE

@@ -25,7 +25,7 @@ from traps_pipeline.cli.command import (
     print_json,
     whole,
 )
-from traps_pipeline.cli.init import create
+from traps_pipeline.cli.init_commands import create
 
 if TYPE_CHECKING:
     from dagster import DagsterInstance
@@ -95,7 +95,7 @@ def add(commands: Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
     from traps_pipeline.base.progress import reporting
-    from traps_pipeline.cli.progress import make_progress
+    from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.scoring.score_rows import LEADERBOARD
 
     experiment = experiment_of(arguments)
