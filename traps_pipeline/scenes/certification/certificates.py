@@ -47,6 +47,7 @@ from traps_pipeline.scenes.worlds.pace import (
     EARLIEST_SHARE,
     LATEST_SHARE,
     READ_S,
+    exchangeable,
     lengths,
     moments,
     out_of_pace,
@@ -804,7 +805,8 @@ def _exchange(pair: Pair) -> Evidence:
     other, lost = pair.exchanged, None
     world, twin = other.control, other.other_world
     so_far: dict[str, Any] = {}
-    for certificate in certificates_for("occluder", "control"):
+    exact = exchangeable(world.family) and world.same_physics and twin.same_physics
+    for certificate in certificates_for("occluder", "control") if exchangeable(world.family) else ():
         so_far |= certificate.measured(other)
         failure = certificate.failure(so_far, other.claim)
         if failure is not None and lost is None:
@@ -812,12 +814,14 @@ def _exchange(pair: Pair) -> Evidence:
     return {
         "twin_commit_s": world.outcome.commit_frame / world.physics.fps,
         "twin_read_answer": None if world.closing is None else world.outcome_read.label,
-        "other_settings": _other_settings(other) if world.same_physics and twin.same_physics else [],
+        "other_settings": _other_settings(other) if exact else [],
         "lost_exchanged": lost,
     }
 
 
 def _judge_exchange(e: Evidence, claim: Claim) -> Judged:
+    if not exchangeable(claim.family):
+        return
     if e.get("other_settings"):
         yield f"had the twin been the control, the {' and the '.join(e['other_settings'])} would be another"
     if e.get("lost_exchanged") is not None:
@@ -841,7 +845,7 @@ EXCHANGE = Certificate(
     "comes (on another CPU or version length and moment are not computed again)",
     does_not_promise="that camera and panel are fitted again (a draw fits them to both worlds, in no order; of the "
     "released records 61 have a camera, and 202 a panel, that was fitted to the control first); which of several other "
-    "worlds is the twin",
+    "worlds is the twin; anything of soft bodies, whose worlds settle too far apart for one length",
     numbers=(
         Number("twin_commit_s", 3),
         *(Number(name, kept=False) for name in ("twin_read_answer", "other_settings", "lost_exchanged")),

@@ -16,8 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.parts.readings import still_from
-from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.physics.kit import Family, Physics
 from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.video.policies import last_of_all
 
@@ -47,9 +48,20 @@ def out_of_pace(share: float) -> str | None:
     return None
 
 
+def exchangeable(family: Family) -> bool:
+    """Whether both worlds of a family's pairs count. Of soft bodies the control alone does: they settle in one world at
+    twice the time of the other, so that no length suits both."""
+    return family.category not in EXTENSION_CATEGORIES
+
+
+def _counted(worlds: Sequence[World]) -> Sequence[World]:
+    return worlds if exchangeable(worlds[0].family) else worlds[:1]
+
+
 def lengths(worlds: Sequence[World], seed: int) -> list[int]:
     """Numbers of frames to try for a clip of simulated worlds, best first: all that there are, or, where the outcome of
     one is early, an even number that follows from the seed, and then the most."""
+    worlds = _counted(worlds)
     n_frames, fps = len(worlds[0].qpos), worlds[0].physics.fps
     first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
     if None in [world.outcome.label for world in worlds] or settles_share(first, n_frames) >= EARLIEST_SHARE:
@@ -65,6 +77,7 @@ def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
     """Frames at which a control may close: when the outcome of every world has been in view, and at rest, for long
     enough; where there is no time for that, and after all others, the last frame that is possible. None where no frame
     is."""
+    worlds = _counted(worlds)
     fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
     last = last_of_all(len(worlds[0].qpos), fps)
     if last - commit < round(READ_S * fps):
