@@ -36,6 +36,7 @@ def test_projection_by_hand() -> None:
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [-1, 2, -1]])
     # focal length 180 px: 1 m at a depth of 2 m is 90 px, at 4 m 45 px
     assert np.allclose(camera.project(points), [[240, 180], [330, 180], [240, 90], [195, 225]])
+    assert np.allclose([camera.metres_a_pixel(point) for point in points], [1 / 90, 1 / 90, 1 / 90, 1 / 45])
 
 
 def test_projection_is_mujocos_own() -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -19,9 +20,16 @@ from traps_pipeline.scenes.certification.certificates import (
     settled_outcome,
 )
 from traps_pipeline.scenes.certification.certify_record import certify
-from traps_pipeline.scenes.certification.ensemble import Cut, Rollout, entropy_bits
+from traps_pipeline.scenes.certification.ensemble import (
+    Cut,
+    Rollout,
+    along_contacts,
+    entropy_bits,
+    unseen_steps,
+)
 from traps_pipeline.scenes.certification.evidence import Claim, Evidence
-from traps_pipeline.scenes.draw.resolve import choose_cut, latest_open_cut
+from traps_pipeline.scenes.draw.resolve import choose_cut, open_cuts
+from traps_pipeline.scenes.draw.sample import Draw, try_draw
 from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics
 from traps_pipeline.scenes.physics.simulate import replay, simulate
@@ -203,6 +211,10 @@ def asking(labels: int) -> Claim:
     return Claim(replace(get_family("plinko"), perturbation=1e-5), end_s=4.9, labels=labels, answer="left")
 
 
+def latest_open_cut(futures: list[Rollout], frames: range, claim: Claim) -> Cut | None:
+    return next(open_cuts(futures, frames, claim), None)
+
+
 def test_of_all_open_frames_the_latest_is_the_cut():
     futures = rollouts(20, left=32, right=32) + rollouts(15, left=40)
     cut = latest_open_cut(futures, range(11, 31), asking(2))
@@ -225,6 +237,60 @@ def test_an_outcome_above_60_percent_makes_no_cut_however_high_the_entropy():
     futures = rollouts(20, a=61, b=9, c=10, d=10, e=10)  # 1.75 bits, but 61 %
     assert latest_open_cut(futures, range(11, 31), asking(2)) is None
     assert latest_open_cut([*futures[1:], Rollout(0, 20, "b")], range(11, 31), asking(2)) is not None
+
+
+# --- the state at the cut ---------------------------------------------------------------------------------------------
+
+
+def ball_and_lever() -> mujoco.MjModel:
+    """A ball of 5 cm that lies on a plate, and a lever whose ends are half a metre from its hinge."""
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1])
+    ball = spec.worldbody.add_body(name="ball", pos=[0, 0, 0.0499])
+    ball.add_freejoint()
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05, 0, 0])
+    lever = spec.worldbody.add_body(name="lever", pos=[0, 2, 1])
+    lever.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+    lever.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.1, 0.4, 0])
+    return spec.compile()
+
+
+def test_what_no_viewer_resolves_is_a_tenth_of_a_pixel_where_a_thing_is() -> None:
+    # Eye at y = -2, half-angle 45 degrees: a pixel is 2/180 m at the ball, which is 2 m away, and 4/180 m at the lever.
+    camera = Camera((0, 0, 0), 2.0, 90.0, 0.0, 90.0, 1.0, (0, 0, 0))
+    model = ball_and_lever()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = unseen_steps(model, data, camera)
+    assert found[:3] == pytest.approx(0.1 * 2 / 180)
+    assert found[3:6] == pytest.approx(0.1 * 2 / 180 / 0.05)
+    assert found[6] == pytest.approx(0.1 * 4 / 180 / 0.5)
+
+
+def test_a_thing_that_lies_on_another_is_moved_along_it_and_not_into_it() -> None:
+    model = ball_and_lever()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 1
+    step = along_contacts(model, data, np.array([3e-4, 2e-4, 5e-4, 1e-3, 0, 0, 1e-3]))
+    assert step == pytest.approx([3e-4, 2e-4, 0, 1e-3, 0, 0, 1e-3], abs=1e-12)
+
+
+def test_the_futures_of_the_state_at_a_cut_disagree_and_are_the_same_each_time(stored: Stored):
+    control = World(stored.family, stored.params, stored.physics, stored.qpos, stored.camera, panel=None)
+    cut = stored.spec.void["cut_frame"]
+    found = futures_of(control, stored.spec.seed, cut).after(cut)
+    assert found == futures_of(control, stored.spec.seed, cut).after(cut)
+    assert found.total() == 48 and len(found) > 1
+    late = stored.outcome.commit_frame + 1
+    assert futures_of(control, stored.spec.seed, late).after(late)[stored.spec.ground_truth] > 40
+
+
+@pytest.mark.slow  # draws a scenario up to its certificates
+def test_a_draw_whose_recorded_outcome_is_a_rare_future_of_its_cut_is_rejected() -> None:
+    looks = ("bystanders", "floor", "light", "material", "panel")
+    rare = try_draw(Draw("seesaw_sorter", 1, 100, frozenset(), looks))  # 45 of 47 futures end in the left bin
+    assert rare == "95.7% of the futures of the state at the cut agree, at most 75% may"
 
 
 @pytest.mark.parametrize("name", CHAOTIC)

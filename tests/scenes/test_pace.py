@@ -34,7 +34,7 @@ def test_an_early_outcome_ends_the_clip_after_a_second_and_six_tenths_more_and_b
     world = whole(EARLY)
     assert world.outcome.commit_frame == 8
     # 8 / 0.3 = 26.7 at most, and 8 + 16 = 24 at least: both even.
-    found = [lengths(world, seed) for seed in range(40)]
+    found = [lengths([world], seed) for seed in range(40)]
     assert {tuple(each) for each in found} == {(24, 26), (26,)}
     assert all(settles_share(8, n) >= 0.3 for each in found for n in each)
 
@@ -42,7 +42,7 @@ def test_an_early_outcome_ends_the_clip_after_a_second_and_six_tenths_more_and_b
 def test_an_outcome_that_is_not_early_leaves_the_clip_as_long_as_it_is() -> None:
     world = whole(LATE)
     assert world.outcome.commit_frame >= 15
-    assert lengths(world, 0) == [50]
+    assert lengths([world], 0) == [50]
     assert cut_to(world, 50) is world
 
 

@@ -77,7 +77,7 @@ def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
 def code_digest(family: str) -> str:
     """Digest of the code that certifies a family: verdicts of other code are not believed."""
     folder = PACKAGE / "scenes"
-    files = [*sorted(folder.glob("*.py")), *sorted(folder.glob("parts/*.py")), folder / "families" / f"{family}.py"]
+    files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])
 
 

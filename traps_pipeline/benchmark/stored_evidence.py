@@ -24,7 +24,7 @@ def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
     """Records whose evidence does not certify the void; one sentence for each certificate that is lost."""
-    return list(_lost(specs, "void", "twin"))
+    return list(_lost(specs, "void", "twin", "worlds"))
 
 
 def _lost(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:

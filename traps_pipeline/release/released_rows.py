@@ -82,7 +82,7 @@ class CertificateRow:
 
     scenario_id: shared.ScenarioId
     certificate: Annotated[str, "name of the certificate"]
-    about: Annotated[str, "control, void, twin or words"]
+    about: Annotated[str, "control, void, twin, worlds or words"]
     promises: Annotated[str, "what it promises"]
     holds: Annotated[bool, "whether the stored numbers meet every threshold"]
     failure: Annotated[str | None, "what is wrong; null where it holds"]

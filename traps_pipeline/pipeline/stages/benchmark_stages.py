@@ -60,7 +60,7 @@ scene_specs = stage(
     group=GROUP,
     parents=[released_specs, corrections],
     scheme=CATEGORY,
-    code="3",
+    code="4",
     kinds=["parquet", "mujoco"],
     shared=Shared(seconds=seconds_left),
     checks=[

@@ -35,8 +35,26 @@ from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import in_frame
 from traps_pipeline.scenes.picture.walls import FACES_THE_EYE_DEG, outlines
-from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, decisive_geoms, read_outcome
-from traps_pipeline.scenes.worlds.pace import EARLIEST_SHARE, LATEST_SHARE, out_of_pace, settles_share
+from traps_pipeline.scenes.worlds.outcome import (
+    Outcome,
+    Rejected,
+    compile_scene,
+    decisive_geoms,
+    read_outcome,
+    simulated,
+)
+from traps_pipeline.scenes.worlds.pace import (
+    EARLIEST_SHARE,
+    LATEST_SHARE,
+    READ_S,
+    exchangeable,
+    lengths,
+    moments,
+    out_of_pace,
+    settles_share,
+    with_length,
+)
+from traps_pipeline.scenes.worlds.shot import shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.video.policies import POLICIES, fewest_within, last_of_all, shown_at_end
@@ -48,7 +66,6 @@ if TYPE_CHECKING:
 
 TURNS_DEG = 10.0  # so far the thing turns that a scene is about
 COMMITTED_BEFORE_END_S = 0.6  # so long the outcome must have stood at the end
-READ_S = 0.8  # so long a settled outcome stands in view before a control closes
 WALL_PIXELS = 150.0  # of the drawn edges of a wall that is not drawn itself
 LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
 REFERENT_PIXELS = 80.0  # of whatever a question names, in each frame of the void
@@ -62,6 +79,9 @@ MIN_ACCEPTED = 64  # futures that look like the control up to the cut and have a
 TOP_SHARE = 0.60  # of the commonest outcome among them: how often the best guess is right
 MIN_ENTROPY_BITS = 1.0
 MIN_ENTROPY_THREE_LABELS_BITS = 0.9
+CUT_SETTLED = 16  # futures of the state at the cut that have an outcome
+CUT_TOP_SHARE = 0.75  # of the commonest outcome among them: a sample of few of what is drawn to be at most TOP_SHARE
+CUT_TRUTH_SHARE = 0.05  # of the recorded outcome: less is a rare future, which nobody who reckons well would expect
 # The futures of another CPU are another sample: what a cut promised by a narrow margin it may miss there by chance.
 ELSEWHERE_ACCEPTED = 48
 ELSEWHERE_TOP_SHARE = 0.80
@@ -279,11 +299,6 @@ PHYSICS = Certificate(
     measure=_physics,
     judge=_judge_physics,
 )
-
-
-def shown_points(model: mujoco.MjModel, scene: Scene, qpos: np.ndarray) -> np.ndarray:
-    """What a picture of a scene must hold: everything that moves over a trajectory, and the stage. Shape (N, 3)."""
-    return np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.framed)])
 
 
 def _in_frame(pair: Pair) -> Evidence:
@@ -589,7 +604,18 @@ def _open(pair: Pair) -> Evidence:
         evidence = ensemble.at_cut(rollouts, pair.void_from, pair.control.family.perturbation).evidence()
         if OPEN.failure(here | evidence, pair.claim) is None:
             break
-    return evidence
+    return {**evidence, **open_from_state(pair.futures, pair.void_from, pair.claim)}
+
+
+def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Evidence:
+    """What the state at a cut leaves open."""
+    counts = {label: n for label, n in futures.after(cut).items() if label is not None}
+    settled = sum(counts.values())
+    return {
+        "cut_settled": settled,
+        "cut_top_share": max(counts.values(), default=0) / max(1, settled),
+        "cut_truth_share": counts.get(claim.answer or "", 0) / max(1, settled),
+    }
 
 
 def _judge_open(e: Evidence, claim: Claim) -> Judged:
@@ -602,6 +628,18 @@ def _judge_open(e: Evidence, claim: Claim) -> Judged:
         yield f"the futures disagree by {e['entropy_bits']:.2f} bits, {least} wanted"
     if e["top_share"] > most:
         yield f"the best guess is right in {e['top_share']:.1%} of the futures, at most {most:.0%} allowed"
+    if "cut_settled" in e and e.get("same_physics", True):
+        yield from _judge_open_at_cut(e)
+
+
+def _judge_open_at_cut(e: Evidence) -> Judged:
+    if e["cut_settled"] < CUT_SETTLED:
+        yield f"{e['cut_settled']} futures of the state at the cut have an outcome, {CUT_SETTLED} wanted"
+    if e["cut_top_share"] > CUT_TOP_SHARE:
+        yield f"{e['cut_top_share']:.1%} of the futures of the state at the cut agree, at most {CUT_TOP_SHARE:.0%} may"
+    if e["cut_truth_share"] < CUT_TRUTH_SHARE:
+        share = f"{e['cut_truth_share']:.1%} of the futures of the state at the cut"
+        yield f"the recorded outcome is a rare one, of {share}, at least {CUT_TRUTH_SHARE:.0%} are wanted"
 
 
 OPEN = Certificate(
@@ -612,13 +650,18 @@ OPEN = Certificate(
     f"is {MIN_ENTROPY_BITS} bit or more ({MIN_ENTROPY_THREE_LABELS_BITS} with three answers), and the "
     f"best guess, the commonest answer, is right in at most {TOP_SHARE * 100:.0f} % of them; on another CPU or version "
     f"the futures are simulated there, are another sample, and are held against {ELSEWHERE_ACCEPTED} futures, "
-    f"{ELSEWHERE_LESS_BITS} bits less and {ELSEWHERE_TOP_SHARE * 100:.0f} %",
+    f"{ELSEWHERE_LESS_BITS} bits less and {ELSEWHERE_TOP_SHARE * 100:.0f} %; where simulating gives the frozen "
+    f"trajectory, of {ensemble.AT_CUT} states at the cut that no viewer tells apart (places differ by "
+    f"{ensemble.UNSEEN_PX} px, speeds by what that is over {ensemble.READ_OVER_S} s, one standard deviation) at least "
+    f"{CUT_SETTLED} end in an outcome, at most {CUT_TOP_SHARE * 100:.0f} % of these in the same one, and at least "
+    f"{CUT_TRUTH_SHARE * 100:.0f} % in the recorded one",
     does_not_promise="that no one could ever compute the future from exact pixels: the perturbation is far below one",
     numbers=(
         Number("entropy_bits", 4, of_futures=True),
         Number("top_share", 4, of_futures=True),
         *(Number(name, of_futures=True) for name in ("accepted", "tried", "unresolved")),
         Number("perturbation"),
+        *(Number(name, kept=False) for name in ("cut_settled", "cut_top_share", "cut_truth_share")),
     ),
     measure=_open,
     judge=_judge_open,
@@ -734,6 +777,85 @@ CLOSING = Certificate(
 )
 
 
+# --- two worlds -------------------------------------------------------------------------------------------------------
+
+
+def _whole(world: World) -> World:
+    """A world of a record as it was before its clip was cut to a length: simulated here for as long as its family
+    says."""
+    physics = with_length(world.physics, world.family.physics.n_frames)
+    if physics == world.physics:
+        return world
+    return replace(world, physics=physics, qpos=simulated(*compile_scene(world.family, world.params, physics), physics))
+
+
+def _other_settings(pair: Pair) -> list[str]:
+    """Which settings of a pair its two worlds, in this order, do not give."""
+    worlds, seed = (pair.control, pair.other_world), pair.claim.seed
+    wholes = [_whole(world) for world in worlds]
+    closing, found = pair.control.closing, []
+    if len(pair.control.qpos) not in lengths(wholes, seed):
+        found.append("length")
+    if closing is not None and closing.frame not in moments(worlds, seed):
+        found.append("closing")
+    return found
+
+
+def _exchange(pair: Pair) -> Evidence:
+    other, lost = pair.exchanged, None
+    world, twin = other.control, other.other_world
+    so_far: dict[str, Any] = {}
+    exact = exchangeable(world.family) and world.same_physics and twin.same_physics
+    for certificate in certificates_for("occluder", "control") if exchangeable(world.family) else ():
+        so_far |= certificate.measured(other)
+        failure = certificate.failure(so_far, other.claim)
+        if failure is not None and lost is None:
+            lost = f"{certificate.name}: {failure}"
+    return {
+        "twin_commit_s": world.outcome.commit_frame / world.physics.fps,
+        "twin_read_answer": None if world.closing is None else world.outcome_read.label,
+        "other_settings": _other_settings(other) if exact else [],
+        "lost_exchanged": lost,
+    }
+
+
+def _judge_exchange(e: Evidence, claim: Claim) -> Judged:
+    if not exchangeable(claim.family):
+        return
+    if e.get("other_settings"):
+        yield f"had the twin been the control, the {' and the '.join(e['other_settings'])} would be another"
+    if e.get("lost_exchanged") is not None:
+        yield f"with the twin as the control: {e['lost_exchanged']}"
+    if e["hidden_from_s"] >= e["twin_commit_s"]:
+        yield "the panel does not hide the outcome of the twin before it is settled"
+    if e["closes_s"] is None:
+        return
+    if e.get("twin_read_answer", claim.twin_answer) != claim.twin_answer:
+        yield f"before the panel comes the twin shows {e['twin_read_answer']!r}, it ends in {claim.twin_answer!r}"
+    if e["closes_s"] - e["twin_commit_s"] < READ_S - _NOISE_S:
+        yield f"the panel comes at {e['closes_s']:.1f} s, less than {READ_S} s after the twin's outcome has settled"
+
+
+EXCHANGE = Certificate(
+    name="exchange",
+    about="worlds",
+    promises="with control and twin exchanged, the length of the clip and the moment at which the control closes are "
+    "computed again, and the record's are among those that a draw tries; the twin passes as a control: all that is "
+    "certified of a control holds for it, its outcome is hidden before it is settled, and is read before the panel "
+    "comes (on another CPU or version length and moment are not computed again)",
+    does_not_promise="that camera and panel are fitted again (a draw fits them to both worlds, in no order; of the "
+    "released records 61 have a camera, and 202 a panel, that was fitted to the control first); which of several other "
+    "worlds is the twin; anything of soft bodies, whose worlds settle too far apart for one length",
+    numbers=(
+        Number("twin_commit_s", 3),
+        *(Number(name, kept=False) for name in ("twin_read_answer", "other_settings", "lost_exchanged")),
+    ),
+    measure=_exchange,
+    judge=_judge_exchange,
+    kinds=("occluder",),
+)
+
+
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
@@ -793,6 +915,7 @@ CERTIFICATES = (
     OPEN,
     TWIN_OF_CUT,
     CLOSING,
+    EXCHANGE,
     WORDS,
 )
 

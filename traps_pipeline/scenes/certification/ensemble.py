@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     import mujoco
 
 TRIED = 128  # starts at most
+AT_CUT = 48  # futures of the state at the cut
+UNSEEN_PX = 0.1  # no viewer reads the place of a thing in a frame more finely
+READ_OVER_S = 0.2  # nor its speed, from two frames of five a second, more finely than such places over that time tell
 # Rollouts tried in all after each batch; the next batch runs only if it can change the verdict.
 BATCHES = (24, 80, TRIED)
 THREADS = 2
@@ -97,6 +100,7 @@ class Futures:
         self._control, self._seed = control, seed
         self._alike_px, self._held = alike_px, round(held_s * control.physics.fps)
         self._rollouts: list[Rollout] = []
+        self._after: dict[int, Counter[str | None]] = {}
 
     def batches(self) -> Iterator[list[Rollout]]:
         """All rollouts so far after each batch of `BATCHES`."""
@@ -117,6 +121,49 @@ class Futures:
         self.start(number)
         known = self._rollouts[number] if number < len(self._rollouts) else None
         return self._roll(number, whole=True) if known is None or known.qpos is None else known
+
+    def after(self, cut: int) -> Counter[str | None]:
+        """How often the futures of the state in the last frame before a cut end in which outcome (None: undecided): of
+        AT_CUT states that differ from it by what no viewer resolves (UNSEEN_PX, READ_OVER_S)."""
+        if cut not in self._after:
+            self._after[cut] = self._simulated_after(cut)
+        return self._after[cut]
+
+    def _simulated_after(self, cut: int) -> Counter[str | None]:
+        import mujoco
+
+        model, control = self._prepared.model, self._control
+        state, past = mujoco.MjData(model), np.empty((cut, model.nq))
+        state.qvel[:] = self._prepared.velocity
+        for i in range(cut):
+            if i:
+                mujoco.mj_step(model, state, control.physics.substeps)
+            past[i] = state.qpos
+        steps = np.random.default_rng([self._seed, AT_CUT, cut]).normal(size=(AT_CUT, 2, model.nv))
+        unseen = unseen_steps(model, state, control.camera)
+
+        def label(step: np.ndarray) -> str | None:
+            data = mujoco.MjData(model)
+            mujoco.mj_copyData(data, model, state)
+            moved = data.qpos.copy()
+            mujoco.mj_integratePos(model, moved, along_contacts(model, state, step[0] * unseen), 1.0)
+            data.qpos[:] = moved
+            data.qvel += step[1] * unseen * math.sqrt(2) / READ_OVER_S
+            frames = np.empty((len(control.qpos), model.nq))
+            frames[:cut] = past
+            for i in range(cut, len(frames)):
+                mujoco.mj_step(model, data, control.physics.substeps)
+                frames[i] = data.qpos
+            return self._settled(frames) if np.isfinite(frames).all() else None
+
+        with ThreadPoolExecutor(THREADS) as pool:
+            return Counter(pool.map(label, steps))
+
+    def _settled(self, frames: np.ndarray) -> str | None:
+        """In which outcome a trajectory (F, nq) ends; None if it is undecided, or not for long enough."""
+        control = self._control
+        labels = control.family.outcome(replay(self._prepared.model, frames, control.physics), control.params).labels
+        return labels[-1] if last_run(labels) <= len(labels) - 1 - self._held else None
 
     def _simulated(self, which: range) -> list[Rollout]:
         with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
@@ -158,10 +205,7 @@ class Futures:
             mujoco.mj_step(prepared.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
             return Rollout(number, parted, None)
-        motion = replay(prepared.model, frames, control.physics)
-        labels = control.family.outcome(motion, control.params).labels
-        settled = last_run(labels) <= len(labels) - 1 - self._held
-        return Rollout(number, parted, labels[-1] if settled else None, frames.astype(np.float32))
+        return Rollout(number, parted, self._settled(frames), frames.astype(np.float32))
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
@@ -196,6 +240,41 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
     for row, step in zip(starts, steps, strict=True):
         mujoco.mj_integratePos(model, row, step, 1.0)
     return starts
+
+
+def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> np.ndarray:
+    """By how much (m, rad) each degree of freedom may differ, for one standard deviation, where its body is seen from a
+    camera: a body by UNSEEN_PX, and what turns by so much at the point that is furthest from its middle. Shape
+    (nv,)."""
+    import mujoco
+
+    scales = np.empty(model.nv)
+    for joint in range(model.njnt):
+        body, dof = model.jnt_bodyid[joint], int(model.jnt_dofadr[joint])
+        geoms = model.geom_bodyid == body
+        metres = UNSEEN_PX * camera.metres_a_pixel(data.xpos[body])
+        radians = metres / (np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]).max()
+        kind = model.jnt_type[joint]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            scales[dof : dof + 6] = [metres] * 3 + [radians] * 3
+        else:
+            scales[dof] = radians if kind == mujoco.mjtJoint.mjJNT_HINGE else metres
+    return scales
+
+
+def along_contacts(model: mujoco.MjModel, data: mujoco.MjData, step: np.ndarray) -> np.ndarray:
+    """A step (nv,) without the parts that push free bodies into, or off, what they touch: these would hit or drop."""
+    normals: dict[int, list[np.ndarray]] = {}
+    for contact in data.contact[: data.ncon]:
+        for geom in contact.geom:
+            normals.setdefault(int(model.geom_bodyid[geom]), []).append(contact.frame[:3])
+    along = step.copy()
+    for body, found in normals.items():
+        if model.body_dofnum[body] == 6:
+            dof = int(model.body_dofadr[body])
+            directions = np.array(found)
+            along[dof : dof + 3] -= np.linalg.pinv(directions) @ directions @ along[dof : dof + 3]
+    return along
 
 
 class _Silhouette:

@@ -7,7 +7,7 @@ and stored evidence are judged alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from traps_pipeline.scenes.certification.ensemble import Futures
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.worlds.world import World
 
 Evidence = Mapping[str, Any]
 VoidKind = Literal["occluder", "truncation"]
-About = Literal["control", "void", "twin", "words"]
+About = Literal["control", "void", "twin", "worlds", "words"]
 Judged = Iterator[str]  # the failures, in words
 
 
@@ -27,7 +27,8 @@ Judged = Iterator[str]  # the failures, in words
 class Claim:
     """What a record says of itself, which its evidence is held against besides the thresholds.
 
-    end_s: time of the control's last frame. labels: how many answers the question offers.
+    end_s: time of the control's last frame. labels: how many answers the question offers. seed: what is drawn of the
+    pair follows from it.
     """
 
     family: Family
@@ -37,6 +38,7 @@ class Claim:
     twin_answer: str | None = None
     question: str = ""
     ill_posed_question: str = ""
+    seed: int = 0
 
     @staticmethod
     def of_record(spec: SceneSpec) -> Claim:
@@ -50,6 +52,7 @@ class Claim:
             twin_answer=spec.twin.ground_truth,
             question=spec.question,
             ill_posed_question=spec.ill_posed_question,
+            seed=spec.seed,
         )
 
 
@@ -81,6 +84,12 @@ class Pair:
         if self.twin is None:
             raise Rejected("the pair has no twin")
         return self.twin
+
+    @property
+    def exchanged(self) -> Pair:
+        """The pair whose control is the twin, and whose twin is the control. Raises Rejected if there is no twin."""
+        claim = replace(self.claim, answer=self.claim.twin_answer, twin_answer=self.claim.answer)
+        return replace(self, control=self.other_world, twin=self.control, claim=claim)
 
 
 @dataclass(frozen=True)

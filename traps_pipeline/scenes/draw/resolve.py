@@ -18,8 +18,8 @@ from traps_pipeline.scenes.certification.certificates import (
     OPEN,
     certificates_for,
     futures_of,
+    open_from_state,
     settled_answer,
-    shown_points,
 )
 from traps_pipeline.scenes.certification.ensemble import Cut, Futures, Rollout
 from traps_pipeline.scenes.certification.evidence import Claim, Evidence, Pair, VoidKind, required
@@ -29,6 +29,7 @@ from traps_pipeline.scenes.physics.kit import Family, Physics, Wording, params_t
 from traps_pipeline.scenes.picture.camera import fit_shot
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.worlds.pace import cut_to, lengths
+from traps_pipeline.scenes.worlds.shot import shot_of, shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec, Twin, trajectory_digest
 from traps_pipeline.scenes.worlds.world import World
 
@@ -100,42 +101,44 @@ def resolve(
 def _of_some_length(
     whole: World, kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """The pair of a simulated control, with all its evidence, of the first length for which it has all certificates.
-    Raises Rejected if there is none."""
-    rejected = Rejected("there is no length")
-    for n_frames in lengths(whole, seed):
-        control = cut_to(whole, n_frames)
-        end_s = (n_frames - 1) / control.physics.fps
-        answer = control.outcome.label
-        claim = Claim(whole.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question)
-        try:
-            pair = Pair(control, claim, futures_of(control, seed))
-            evidence = required(certificates_for(kind, "control"), pair, {})
-            candidates = _cut_short(pair) if control.panel is None else _covered(pair)
-            pair, evidence = _with_certified_void(candidates, kind, evidence)
-            return closed(pair, seed, evidence)
-        except Rejected as failure:
-            rejected = failure  # another length may do
+    """The pair of a simulated control, with all its evidence, of the first other world and the first length for which
+    it has all certificates. Raises Rejected if there is none."""
+    rejected = Rejected("no other hidden element gives another outcome")
+    for worlds in [(whole,)] if kind == "truncation" else _with_others(whole):
+        for n_frames in lengths(worlds, seed):
+            control, *others = (cut_to(world, n_frames) for world in worlds)
+            end_s = (n_frames - 1) / control.physics.fps
+            answer = control.outcome.label
+            claim = Claim(
+                whole.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question, seed
+            )
+            try:
+                pair = Pair(control, claim, futures_of(control, seed))
+                evidence = required(certificates_for(kind, "control"), pair, {})
+                candidates = trimmed(_with_twin(pair, None, others[0])) if others else _cut_short(pair)
+                return _first_certified(candidates, kind, seed, evidence)
+            except Rejected as failure:
+                rejected = failure  # another length, or another world, may do
     raise rejected
 
 
 def _control(family: Family, params: Any, physics: Physics) -> World:
-    """The control of a draw: simulated, and with its camera and panel fitted."""
+    """The control of a draw: simulated, and with its camera and panel fitted to itself."""
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
     camera, panel = fit_shot(scene.view, shown_points(model, scene, qpos), scene.cover)
     return World(family, params, physics, qpos, camera, panel, simulated=qpos)
 
 
-def _with_certified_void(
-    candidates: Iterable[Pair], kind: VoidKind, so_far: Evidence
+def _first_certified(
+    candidates: Iterable[Pair], kind: VoidKind, seed: int, so_far: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """The first of some pairs, which differ in twin and panel, whose void and twin are certified. Raises Rejected if
-    none is."""
+    """The first of some pairs, which differ in their panel, whose void and twin are certified and whose control can
+    end. Raises Rejected if none is."""
     rejected = Rejected("there is no twin")
     for pair in candidates:
         try:
-            return pair, required(certificates_for(kind, "void", "twin"), pair, so_far)
+            return closed(pair, seed, required(certificates_for(kind, "void", "twin"), pair, so_far))
         except Rejected as failure:
             rejected = failure  # the next one may hide more, or be alike
     raise rejected
@@ -144,25 +147,15 @@ def _with_certified_void(
 # --- occlusion --------------------------------------------------------------------------------------------------------
 
 
-def _covered(pair: Pair) -> Iterator[Pair]:
-    """The pair with its void, for each other world that may be its twin, behind the panels that this twin may do with.
-    Raises Rejected if there is no other world."""
-    worlds = _other_worlds(pair.control)
-    if not worlds:
-        raise Rejected("no other hidden element gives another outcome")
-    return (shown for world in worlds for shown in trimmed(_with_twin(pair, None, world)))
-
-
 def _with_twin(pair: Pair, frame: int | None, twin: World) -> Pair:
     claim = replace(pair.claim, twin_answer=twin.outcome.label)
     return replace(pair, claim=claim, void_frame=frame, twin=twin)
 
 
-def _other_worlds(control: World) -> list[World]:
-    """Worlds with another hidden element and another settled outcome."""
+def _with_others(control: World) -> Iterator[tuple[World, World]]:
+    """The control with each world that has another hidden element and another settled outcome, seen by one camera."""
     family, physics = control.family, control.physics
     assert family.twins is not None, f"{family.name}: an occlusion family needs twins"
-    worlds = []
     for params in family.twins(control.params):
         try:
             qpos = simulated(*compile_scene(family, params, physics), physics)
@@ -170,8 +163,8 @@ def _other_worlds(control: World) -> list[World]:
             continue  # this other world diverges; the next one may not
         world = replace(control, params=params, qpos=qpos, simulated=qpos)
         if settled_answer(world) not in (None, control.outcome.label):
-            worlds.append(world)
-    return worlds
+            camera, panel = shot_of((control, world))
+            yield replace(control, camera=camera, panel=panel), replace(world, camera=camera, panel=panel)
 
 
 # --- chaotic ----------------------------------------------------------------------------------------------------------
@@ -198,16 +191,16 @@ def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, 
             if _hopeless(rollouts, futures.first):
                 return None
             continue
-        cut = latest_open_cut(rollouts, range(futures.first, commit_frame + 1), claim)
-        if cut is not None:
-            return cut, ensemble.twin_of(rollouts, cut.frame, claim.answer)
+        for cut in open_cuts(rollouts, range(futures.first, commit_frame + 1), claim):
+            if OPEN.failure({**cut.evidence(), **open_from_state(futures, cut.frame, claim)}, claim) is None:
+                return cut, ensemble.twin_of(rollouts, cut.frame, claim.answer)
     return None
 
 
-def latest_open_cut(rollouts: Sequence[Rollout], frames: range, claim: Claim) -> Cut | None:
-    """The last of the frames at which a cut is certified to leave the outcome open, or None."""
+def open_cuts(rollouts: Sequence[Rollout], frames: range, claim: Claim) -> Iterator[Cut]:
+    """The cuts at which the futures of many starts leave the outcome open, latest first."""
     cuts = (ensemble.at_cut(rollouts, frame, claim.family.perturbation) for frame in reversed(frames))
-    return next((cut for cut in cuts if OPEN.failure(cut.evidence(), claim) is None), None)
+    return (cut for cut in cuts if OPEN.failure(cut.evidence(), claim) is None)
 
 
 def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:

@@ -8,7 +8,7 @@ floor as before, and the camera stays. What else the family's box held is then s
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -34,16 +34,18 @@ def trimmed(pair: Pair) -> Iterator[Pair]:
 
 
 def must_hide(pair: Pair) -> np.ndarray:
-    """The pixels of a 480x360 frame that a panel must cover, (H, W) bool, found without any panel."""
-    control, twin = pair.control, pair.other_world
-    until = max(control.outcome.commit_frame - 1, 0)
-    decisive = decisive_geoms(control.model, control.scene.decisive)
-    with control.renderer() as renderer:
-        whole = list(renderer.frames(control.qpos))
-        needed = _differ(whole, renderer.frames(control.qpos, without=control.scene.hidden))
-        needed |= _differ(whole[until:], renderer.frames(control.qpos[until:], without=decisive))
-    with twin.renderer() as renderer:
-        return needed | _differ(whole, renderer.frames(twin.qpos))
+    """The pixels of a 480x360 frame that a panel must cover, (H, W) bool, found without any panel; the same if the two
+    worlds are exchanged."""
+    needed, drawn = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
+    for world in (pair.control, pair.other_world):
+        until = max(world.outcome.commit_frame - 1, 0)
+        decisive = decisive_geoms(world.model, world.scene.decisive)
+        with world.renderer(supersample=1) as renderer:  # a margin is left, and certificates judge
+            whole = list(renderer.frames(world.qpos))
+            needed |= _differ(whole, renderer.frames(world.qpos, without=world.scene.hidden))
+            needed |= _differ(whole[until:], renderer.frames(world.qpos[until:], without=decisive))
+        drawn.append(whole)
+    return needed | _differ(*drawn)
 
 
 def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> Panel:
@@ -66,7 +68,7 @@ def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> 
     return replace(panel, centre=(x, y, half[2]), half=half)
 
 
-def _differ(frames: Sequence[np.ndarray], others: Iterator[np.ndarray]) -> np.ndarray:
+def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.ndarray:
     """Where any frame differs from its other one, on the grid of 480x360."""
     found = np.zeros((HEIGHT, WIDTH), bool)
     for frame, other in zip(frames, others, strict=True):

@@ -49,6 +49,11 @@ class Camera:
         focal = HEIGHT / 2 / np.tan(np.radians(self.fovy_deg) / 2)
         return np.stack([WIDTH / 2 + focal * right / depth, HEIGHT / 2 - focal * up / depth], axis=1)
 
+    def metres_a_pixel(self, point: np.ndarray) -> float:
+        """How long a pixel of 480x360 is at the depth of a point (3,)."""
+        depth = float(self.axes()[2] @ (point - self.position()))
+        return depth * float(np.tan(np.radians(self.fovy_deg) / 2)) / (HEIGHT / 2)
+
 
 @dataclass(frozen=True)
 class Panel:

@@ -20,7 +20,6 @@ from traps_pipeline.scenes.certification.certificates import (
     EARLIEST_CUT_S,
     legible_groups,
     settled_answer,
-    shown_points,
 )
 from traps_pipeline.scenes.parts.wording import false_premise
 from traps_pipeline.scenes.physics.kit import View
@@ -29,6 +28,7 @@ from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import PANEL_HALF_THICKNESS, Panel, fit_camera
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms
+from traps_pipeline.scenes.worlds.shot import shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 

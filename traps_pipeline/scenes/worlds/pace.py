@@ -1,23 +1,37 @@
-"""How long a clip is: its outcome settles neither at its beginning, so that watching on were idle, nor at its very end.
+"""How long a clip is, and when it closes: its outcome settles neither at its beginning, so that watching on were idle,
+nor at its very end.
 
 A scene is simulated for as long as its family says. Where the outcome settles early the clip ends earlier, void and
 control alike, so that its length tells nothing of the side. A clip is never longer than its family's: 25 frames of five
 a second are what models are shown. So where the outcome settles too late the scene is drawn anew.
+
+Of an occlusion pair both worlds count, and which of them is the control makes no difference: neither length nor closing
+tells which world the panel hides.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
+from traps_pipeline.scenes.parts.readings import still_from
+from traps_pipeline.scenes.physics.kit import Family, Physics
 from traps_pipeline.scenes.worlds.world import World
+from traps_pipeline.video.policies import last_of_all
 
 EARLIEST_SHARE = 0.3  # of the clip's frames, before the outcome settles
 LATEST_SHARE = 0.8
 DRAWN_SHARE = 0.5  # in a clip that ends earlier the outcome settles after a share between the earliest and this
 FRAMES_AFTER = 16  # to see the outcome for a second, and a panel before it until the end
+READ_S = 0.8  # so long a settled outcome stands in view before a control closes
+READ_BY_DRAW_S = 1.0  # so long it is in view where there is time for it
+REST_BY_DRAW_S = 0.6  # so long it has been at rest by then: three frames of five a second
+STILL_M = 0.005  # a pixel or two
+BESIDE_M = 0.03  # from the middle of a body to the points by which it is seen to turn
+TRIES = 4  # moments at which it is tried to close a control
 
 
 def settles_share(commit_frame: int, n_frames: int) -> float:
@@ -34,18 +48,51 @@ def out_of_pace(share: float) -> str | None:
     return None
 
 
-def lengths(control: World, seed: int) -> list[int]:
-    """Numbers of frames to try for a clip of a simulated control, best first: all that there are, or for an early
-    outcome an even number that follows from the seed, and then the most."""
-    commit, n_frames = control.outcome.commit_frame, len(control.qpos)
-    if control.outcome.label is None or settles_share(commit, n_frames) >= EARLIEST_SHARE:
+def exchangeable(family: Family) -> bool:
+    """Whether both worlds of a family's pairs count. Of soft bodies the control alone does: they settle in one world at
+    twice the time of the other, so that no length suits both."""
+    return family.category not in EXTENSION_CATEGORIES
+
+
+def _counted(worlds: Sequence[World]) -> Sequence[World]:
+    return worlds if exchangeable(worlds[0].family) else worlds[:1]
+
+
+def lengths(worlds: Sequence[World], seed: int) -> list[int]:
+    """Numbers of frames to try for a clip of simulated worlds, best first: all that there are, or, where the outcome of
+    one is early, an even number that follows from the seed, and then the most."""
+    worlds = _counted(worlds)
+    n_frames, fps = len(worlds[0].qpos), worlds[0].physics.fps
+    first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
+    if None in [world.outcome.label for world in worlds] or settles_share(first, n_frames) >= EARLIEST_SHARE:
         return [n_frames]
-    fps = control.physics.fps
-    most = _even(commit / EARLIEST_SHARE)
-    least = min(most, _even(max(commit / DRAWN_SHARE, commit + FRAMES_AFTER * fps / 10)))
-    rng = np.random.default_rng([seed, *control.family.name.encode(), *b"pace"])
+    most = _even(first / EARLIEST_SHARE)
+    least = min(most, _even(max(last / DRAWN_SHARE, last + FRAMES_AFTER * fps / 10)))
+    rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"pace"])
     drawn = least + 2 * int(rng.integers((most - least) // 2 + 1))
     return list(dict.fromkeys((drawn, most)))
+
+
+def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
+    """Frames at which a control may close: when the outcome of every world has been in view, and at rest, for long
+    enough; where there is no time for that, and after all others, the last frame that is possible. None where no frame
+    is."""
+    worlds = _counted(worlds)
+    fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
+    last = last_of_all(len(worlds[0].qpos), fps)
+    if last - commit < round(READ_S * fps):
+        return
+    rests = max(map(_at_rest_from, worlds)) + round(REST_BY_DRAW_S * fps)
+    first = min(max(commit + round(READ_BY_DRAW_S * fps), rests), last)
+    rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"closing"])
+    drawn = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
+    yield from dict.fromkeys([*drawn[: TRIES - 1], last])
+
+
+def _at_rest_from(world: World) -> int:
+    """The frame from which every decisive body stays as it lies at the end: its middle, and three points around it."""
+    paths = [world.motion.places(body, BESIDE_M) for body in world.scene.decisive]
+    return still_from(*paths, within_m=STILL_M)
 
 
 def _even(frames: float) -> int:

@@ -16,7 +16,7 @@ from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture.camera import Camera, Closing, Panel
 from traps_pipeline.scenes.picture.checks import PastPanel, differing_pixels, void_frames
 from traps_pipeline.scenes.picture.coming_board import Coming, coming_board
-from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.picture.render import SUPERSAMPLE, Renderer
 from traps_pipeline.scenes.worlds.outcome import (
     Outcome,
     compile_scene,
@@ -136,9 +136,9 @@ class World:
         """The frames that pixel evidence looks at."""
         return range(0, len(self.qpos), self.frame_step)
 
-    def renderer(self) -> Renderer:
+    def renderer(self, *, supersample: int = SUPERSAMPLE) -> Renderer:
         """A renderer of this world; close it before another one is opened."""
-        return Renderer(self.model, self.camera)
+        return Renderer(self.model, self.camera, supersample=supersample)
 
     @property
     def concealed(self) -> tuple[str, ...]:
