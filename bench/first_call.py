@@ -44,7 +44,7 @@ def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
     asked has rows of other keys too."""
     from traps_pipeline.models.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
-    from traps_pipeline.pipeline.wanted import Wanted
+    from traps_pipeline.pipeline.wanted import StudyPartitions
     from traps_pipeline.protocol.cells import Evaluation
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
@@ -53,7 +53,7 @@ def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
         reasoning_tokens=20, cost_usd=0.0002,
     )  # fmt: skip
     asked = Evaluation("image-model", "standard", 1)
-    evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
+    evaluations = [asked, *(e for e in StudyPartitions(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):
         evaluation = evaluations[start // EVALUATION_ROWS % len(evaluations)]
         part = list[Any]()

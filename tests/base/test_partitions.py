@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, SteeringCell
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
@@ -21,7 +21,7 @@ from traps_pipeline.protocol.datasets import (
 
 
 def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:
-    every = Wanted(None).evaluations
+    every = StudyPartitions(None).evaluations
     cells = [Cell(dataset, e) for dataset in DATASETS for e in every]
     assert all(Cell.parse(cell.key) == cell for cell in cells)
     assert all(Evaluation.parse(e.key) == e for e in every)

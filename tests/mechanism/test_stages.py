@@ -48,12 +48,12 @@ from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
 from traps_pipeline.storage.media import MediaSpec
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -217,7 +217,7 @@ def test_probes_of_another_prompt_are_fitted_where_they_are_asked_for(own: Works
         probes = own.mechanism.probes.model_copy(update={"prompts": prompts})
         own = own.allow(mechanism=own.mechanism.model_copy(update={"probes": probes}))
         for name in ("probes", "probe_baselines"):
-            assert the_graph()[name].wanted(Wanted(own)) == [f"tiny__{prompt}" for prompt in prompts]
+            assert the_graph()[name].wanted(StudyPartitions(own)) == [f"tiny__{prompt}" for prompt in prompts]
     guided = Extraction("tiny", "guided")
     for dataset in DATASETS:
         cell = StatesCell(dataset, guided)
@@ -252,8 +252,8 @@ def test_a_layer_that_the_model_has_not_is_told_before_anything_is_extracted(own
 
 
 def written(
-    workspace: Workspace, table: Table, done: Iterable[tuple[SteeringCell, Made]]
-) -> list[tuple[SteeringCell, Made]]:
+    workspace: Workspace, table: Table, done: Iterable[tuple[SteeringCell, StageOutput]]
+) -> list[tuple[SteeringCell, StageOutput]]:
     """Write each cell as it is done."""
     kept = []
     for cell, made in done:

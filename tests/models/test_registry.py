@@ -10,7 +10,7 @@ from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import get_model, load_models
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
 
@@ -78,7 +78,7 @@ def test_every_model_regime_and_run_is_one_evaluation_model_outermost() -> None:
     expected = [
         (m.id, regime, run) for m in load_models().values() for regime in REGIMES for run in range(1, m.runs + 1)
     ]
-    found = Wanted(None).evaluations
+    found = StudyPartitions(None).evaluations
     assert [(e.model, e.regime, e.run) for e in found] == expected
     assert Evaluation("oracle", "json", 2) not in found  # one run: no run2 key
     assert Evaluation("random-50", "json", 3) in found

@@ -14,7 +14,7 @@ from traps_pipeline.definitions import defs
 from traps_pipeline.pipeline import stage as declaration
 from traps_pipeline.pipeline.graph import JOB_GROUPS, the_graph
 from traps_pipeline.pipeline.translation import asset_key
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 
 DAGSTER = defs.get_repository_def().asset_graph
 GRAPH = the_graph()
@@ -126,4 +126,4 @@ def test_each_asset_shows_the_sensors_that_make_it_again() -> None:
 
 def test_a_group_that_no_job_makes_is_refused_where_it_is_declared() -> None:
     with pytest.raises(ValueError, match="no job makes the group extras; add it to JOB_GROUPS"):
-        declaration.stage("extra", lambda workspace, key: Made({}), group="extras", parents=[])
+        declaration.stage("extra", lambda workspace, key: StageOutput({}), group="extras", parents=[])

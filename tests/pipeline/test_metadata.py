@@ -8,12 +8,12 @@ import pytest
 from tests.mechanism.study import filled
 from traps_pipeline.mechanism.control_rows import GATE
 from traps_pipeline.pipeline.metadata import preview
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 
 ROWS = [filled(GATE, target=name, pecs=pecs) for name, pecs in (("low", 0.1), ("high", 0.9), ("none", None))]
 
 
 @pytest.mark.parametrize("content", [ROWS, pd.DataFrame(ROWS)], ids=["rows", "frame"])
 def test_the_best_rows_of_a_table_that_ranks_are_shown_first(content: list | pd.DataFrame) -> None:
-    shown = preview(GATE, Made(content))["best by pecs"]
+    shown = preview(GATE, StageOutput(content))["best by pecs"]
     assert [record.data["target"] for record in shown.records] == ["high", "low"]

@@ -11,23 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traps_pipeline.pipeline.partitioning import Scheme
+from traps_pipeline.pipeline.partitioning import Partitioning
 from traps_pipeline.pipeline.ranges import WORTH_S, cut, shared_out
 from traps_pipeline.pipeline.schemes import CATEGORY, CELL, DATASET
 from traps_pipeline.pipeline.translation import partitions_of
 
 
-def keys_of(scheme: Scheme, ranges: Sequence[Any]) -> list[str]:
+def keys_of(scheme: Partitioning, ranges: Sequence[Any]) -> list[str]:
     """Every key of every range, as Dagster reads it."""
     read = partitions_of(scheme).get_partition_keys_in_range
     return [key for first, last in ranges for key in read(dg.PartitionKeyRange(str(first), str(last)))]
 
 
-def grid_of(n_datasets: int, n_evaluations: int) -> Scheme:
+def grid_of(n_datasets: int, n_evaluations: int) -> Partitioning:
     """Cells of so many datasets, and of models with nine runs each."""
     datasets = [f"d{n:02d}" for n in range(n_datasets)]
     evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(n_evaluations)]
-    return Scheme({"dataset": datasets, "evaluation": evaluations}, lambda _: {}, lambda _: [])
+    return Partitioning({"dataset": datasets, "evaluation": evaluations}, lambda _: {}, lambda _: [])
 
 
 GRID = grid_of(6, 20)
@@ -66,7 +66,7 @@ def test_a_study_of_whole_models_is_cut_into_as_many_runs_of_one_size(n_datasets
 
 def test_fewer_runs_than_models_load_each_model_once() -> None:
     evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(90)]
-    scheme = Scheme({"evaluation": evaluations}, lambda _: {}, lambda _: [])
+    scheme = Partitioning({"evaluation": evaluations}, lambda _: {}, lambda _: [])
     parts = [keys_of(scheme, [one]) for one in cut(scheme, evaluations, 7)]
     models = [model for part in parts for model in {key.partition("__")[0] for key in part}]
     assert len(parts) == 7 and sorted(models) == sorted({*models})

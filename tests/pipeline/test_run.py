@@ -16,7 +16,7 @@ from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.schemes import CELL, DATASET
 from traps_pipeline.pipeline.translation import partitions_of
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.study import Study
@@ -43,7 +43,7 @@ def test_batches_of_any_cells_run_each_once_and_no_other() -> None:
 
 @pytest.mark.parametrize("datasets", [DATASETS, DATASETS[:2], DATASETS[1:3], ("occlusion", "chaotic_ill_posed")])
 def test_whole_models_are_few_runs(datasets: Sequence[str]) -> None:
-    oracle = [e for e in Wanted(None).evaluations if e.model in ("oracle", "always-abstain")]
+    oracle = [e for e in StudyPartitions(None).evaluations if e.model in ("oracle", "always-abstain")]
     keys = [Cell(dataset, e).key for e in oracle for dataset in datasets]
     assert expanded(keys) == Counter(keys)
     neighbours = 1 if datasets != ("occlusion", "chaotic_ill_posed") else 2

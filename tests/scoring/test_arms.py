@@ -17,7 +17,7 @@ from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
 from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
 from traps_pipeline.scoring.score_rows import CONTRASTS
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -26,7 +26,7 @@ MODELS = {"oracle": (True, False, True), "prior": (True, True, False)}
 
 def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
     """Every table of figures over the pairs, and every frame that tables and figures of the report are made from."""
-    made: dict[str, Made] = {"contrasts": scoring_stages._make_contrasts(workspace, None)}
+    made: dict[str, StageOutput] = {"contrasts": scoring_stages._make_contrasts(workspace, None)}
     workspace.tables.write(CONTRASTS, {}, made["contrasts"].frame, {})
     made["regime_tests"] = scoring_stages._make_regime_tests(workspace, None)
     made["leaderboard"] = scoring_stages._make_leaderboard(workspace, None)

@@ -36,7 +36,7 @@ from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
@@ -205,7 +205,7 @@ class Labels(BaseModel):
 # --- the confabulation stage ------------------------------------------------------------------------------------------
 
 
-def collect_labels(workspace: Workspace) -> Made:
+def collect_labels(workspace: Workspace) -> StageOutput:
     """CONFABULATION rows of a study: sample every model of the protocol whose answers are judged, and ask the judge for
     the labels that the ledger of votes does not hold.
 
@@ -214,18 +214,18 @@ def collect_labels(workspace: Workspace) -> Made:
     protocol, table, total = load_protocol(), list[ConfabulationRow](), Tally()
     judge = protocol.judge(workspace.study.panel)
     if judge is None:
-        return Made(table)
+        return StageOutput(table)
     samples: dict[Cell, list[Failure]] = {}
     for model in protocol.models:
         samples |= sample_failures(workspace, judge, model)
 
-    def finish(settled: Settled[Cell, Failure]) -> tuple[Cell, Made]:
+    def finish(settled: Settled[Cell, Failure]) -> tuple[Cell, StageOutput]:
         return settled.made(_label_row)
 
     for _, made in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
         table.extend(made.rows(CONFABULATION))
         total.add(made.tally)
-    return Made(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
+    return StageOutput(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
 
 
 def _label_row(cell: Cell, failure: Failure, row: Row) -> ConfabulationRow:

@@ -35,8 +35,8 @@ from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.judges import (
+    Judge,
     JudgeEntry,
-    Seat,
     Task,
     load_panel,
     panel_id,
@@ -50,7 +50,7 @@ from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.storage.parquet import Made, joined
+from traps_pipeline.storage.parquet import StageOutput, joined
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -89,7 +89,7 @@ def about_answer(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
 
 
 def judge_request(
-    judge: Seat, system: str, schema: Mapping[str, Any], about: Mapping[str, str | int], user: str
+    judge: Judge, system: str, schema: Mapping[str, Any], about: Mapping[str, str | int], user: str
 ) -> Request:
     """The call to a judge for one task about one answer of a cell; the judge returns the schema's JSON."""
     return Request(
@@ -103,7 +103,7 @@ def judge_request(
 
 
 def vote_requests(
-    judges: Sequence[Seat], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
+    judges: Sequence[Judge], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
 ) -> list[Request]:
     """Each judge's call for its vote on one task about one answer. All are shown the same text."""
     user, about = (
@@ -113,7 +113,7 @@ def vote_requests(
     return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), about, user) for judge in judges]
 
 
-def vote_request(judge: Seat, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
+def vote_request(judge: Judge, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
     """The call for one judge's vote."""
     return vote_requests([judge], task, cell, item, answer)[0]
 
@@ -237,7 +237,7 @@ class Part(Cell):
         return Cell(self.dataset, self.evaluation)
 
 
-def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
+def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, StageOutput]]:
     """Ask the study's panel for missing votes; yields the VOTES rows of each cell when it is done."""
     study = workspace.study
     require_panel(
@@ -245,7 +245,7 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     )
     panel, row_of = load_panel(study.panel), partial(_vote_row, panel_id(study.panel))
     parts = {cell: _parts(workspace, cell) for cell in cells}
-    done: dict[Cell, list[Made]] = {}
+    done: dict[Cell, list[StageOutput]] = {}
 
     def calls(part: Part) -> list[Ballot]:
         return wanted_ballots(workspace, panel, part.whole, part.start, PART)

@@ -38,7 +38,7 @@ from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import SteeringCell
 from traps_pipeline.protocol.datasets import SIDES, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -257,7 +257,7 @@ def collect_steered(
     entry: ModelEntry,
     cells: Sequence[SteeringCell],
     directions: Mapping[str, Mapping[str, Directions]],
-) -> Iterator[tuple[SteeringCell, Made]]:
+) -> Iterator[tuple[SteeringCell, StageOutput]]:
     """Generate the missing answers; yields the STEERING rows of each finished cell. directions: by VQA prompt, then by
     source.
 
@@ -280,7 +280,7 @@ def collect_steered(
         made.chunks([each.request for each in wanted])
         return wanted
 
-    def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, Made]:
+    def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
         made.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
@@ -332,7 +332,9 @@ def _steering_row(
 # --- the panel's votes ------------------------------------------------------------------------------------------------
 
 
-def collect_steering_votes(workspace: Workspace, cells: Sequence[SteeringCell]) -> Iterator[tuple[SteeringCell, Made]]:
+def collect_steering_votes(
+    workspace: Workspace, cells: Sequence[SteeringCell]
+) -> Iterator[tuple[SteeringCell, StageOutput]]:
     """Ask the study's panel whether each steered answer abstains and whether a control's is correct; yields the
     STEERING_VOTES rows of each finished cell."""
     panel = load_panel(workspace.study.panel)

@@ -24,7 +24,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 # The columns of an item that a request, a response or a vote is made from.
@@ -139,11 +139,11 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
     )
 
 
-def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
+def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, StageOutput]]:
     """Ask what is missing; the RESPONSES rows of each cell as it is done."""
     prepare_media(workspace, cells)
 
-    def finish(settled: Settled[Cell, Question]) -> tuple[Cell, Made]:
+    def finish(settled: Settled[Cell, Question]) -> tuple[Cell, StageOutput]:
         traces = workspace.answers.reasoning(settled.cell.evaluation.key, settled.rows)
         return settled.made(lambda cell, question, row: response_row(cell, question.item, row, traces.get(row["key"])))
 

@@ -28,7 +28,7 @@ from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.models.spending import sharing, spending
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -62,12 +62,12 @@ class Settled(Generic[AnyCell, AnyCall]):
         """Each call with its row of the ledger."""
         return ((call, self.rows[call.request.key]) for call in self.calls)
 
-    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, Made]:
+    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
         """The cell and its table, a row a call, with how the calls went."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
         counts = {"wanted": len(self.rows), "known": self.tally.cached, "asked": self.tally.asked}
         shown = {**counts, "failed": self.tally.errors, "dollars": round(dollars, 6)}
-        return self.cell, Made([row_of(self.cell, *pair) for pair in self.answered()], self.tally, shown)
+        return self.cell, StageOutput([row_of(self.cell, *pair) for pair in self.answered()], self.tally, shown)
 
 
 @dataclass(frozen=True)

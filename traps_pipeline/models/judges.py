@@ -60,7 +60,7 @@ SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
 _WITH_PREMISE = structured("abstention", **_ABSTENTION, rejects_premise={"type": "boolean"})
 
 
-class Seat(typing.Protocol):
+class Judge(typing.Protocol):
     """What of a judge decides its votes, wherever it is described."""
 
     @property
@@ -94,13 +94,13 @@ class Seat(typing.Protocol):
         ...
 
 
-def vote_prompt(seat: Seat, task: Task) -> str:
+def vote_prompt(seat: Judge, task: Task) -> str:
     """Return the system prompt of a task: the paper's, with ours about the premise for a judge that is asked for it."""
     text = prompt(f"judge_{task}")
     return f"{text}\n\n{prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
 
-def vote_schema(seat: Seat, task: Task) -> Mapping[str, Any]:
+def vote_schema(seat: Judge, task: Task) -> Mapping[str, Any]:
     """Return the JSON schema of a judge's vote on a task."""
     return _WITH_PREMISE if seat.premise and task == "abstention" else SCHEMAS[task]
 
@@ -191,7 +191,7 @@ def panel_version(panel: str) -> str:
     return version_of_seats(load_panel(panel)) if panel else "no panel is named"
 
 
-def version_of_seats(seats: Iterable[Seat]) -> str:
+def version_of_seats(seats: Iterable[Judge]) -> str:
     """Version of what these judges decide."""
     judges = list[list[Any]]()
     for seat in seats:
@@ -206,7 +206,7 @@ def panel_id(panel: str) -> str:
     return id_of_seats(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
 
 
-def id_of_seats(name: str, seats: Sequence[Seat]) -> str:
+def id_of_seats(name: str, seats: Sequence[Judge]) -> str:
     """What stands for a panel of this name and these judges."""
     return f"{name}@{version_of_seats(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
 

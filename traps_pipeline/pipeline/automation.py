@@ -27,12 +27,12 @@ from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.machine import require_machine, wanted_parts
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
-from traps_pipeline.pipeline.run import pending_in, walk
+from traps_pipeline.pipeline.run import materialize_stale, pending_in
 from traps_pipeline.pipeline.runs import RunsHere, range_tags
 from traps_pipeline.pipeline.selection import failed_checks
 from traps_pipeline.pipeline.step import MAKE_TAG, OUTDATED, STALE
 from traps_pipeline.pipeline.translation import asset_key
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
 
 DESCRIPTIONS = {
@@ -82,7 +82,7 @@ def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
         require_machine(opened, wanted_parts(opened, names))
         every_asset = context.repository_def.get_implicit_global_asset_job_def()
         runs = RunsHere(context.instance, every_asset, parent=context.run, log=context.log.info)
-        outcome = walk(context.instance, runs, opened, names)
+        outcome = materialize_stale(context.instance, runs, opened, names)
         if runs.finished:
             context.add_output_metadata({"runs": dg.MetadataValue.table([dg.TableRecord(r) for r in runs.finished])})
         if problems := [*dict.fromkeys([*outcome.problems, *failed_checks(opened, None)])]:
@@ -102,7 +102,7 @@ def _stages(costs: bool) -> list[Stage]:
 def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
     """Fail the check `current` for what Dagster does not see by itself: files that are altered or gone, and assets
     without partitions that are not current. reported: what this process has reported before."""
-    wanted, history = Wanted(workspace), History(instance, the_graph())
+    wanted, history = StudyPartitions(workspace), History(instance, the_graph())
     for stage in the_graph().stages:
         recorded = history.recorded(stage.name)
         for key in stage.wanted(wanted):
@@ -130,7 +130,7 @@ def _requests(
     """Runs of what is outdated and can be made anew now. What waits for these is requested at a later look."""
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
-        stages, keys = pending_in(block, lineage, History(instance, graph), Wanted(workspace), existing=True)
+        stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # What is outdated and stays so, with the same inputs, is tried once: it fails for a reason of its own.
         seen = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]

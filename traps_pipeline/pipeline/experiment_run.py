@@ -23,7 +23,7 @@ from traps_pipeline.pipeline.selection import (
     require_work,
     stages_until,
 )
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import Workspace
 
@@ -74,7 +74,7 @@ def run_experiment(
     require_work(workspace, experiment.name, until)
     if is_nothing_to_do(workspace, stages, experiment.name):
         return RunReport(failed_checks(workspace, experiment.name))
-    from traps_pipeline.pipeline.run import dagster_history, walk
+    from traps_pipeline.pipeline.run import dagster_history, materialize_stale
 
     with dagster_history(workspace) as instance:
         participants = _still_to_ask(workspace, experiment, stages)
@@ -87,7 +87,7 @@ def run_experiment(
         if preflight is not None:
             _preflight(workspace, participants, preflight)
         with open_runs(instance, workspace) as runs:
-            result = walk(instance, runs, workspace, stages, experiment=experiment.name)
+            result = materialize_stale(instance, runs, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*result.problems, *failed_checks(workspace, experiment.name)])]
     if not problems:
         note_versions(workspace, stages, experiment.name)
@@ -104,7 +104,7 @@ class _Participants:
 
 def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
     """Return the models and judges that the ledger does not hold all answers of."""
-    lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
+    lineage, cells = Lineage(workspace), StudyPartitions(workspace, experiment.name).cells
 
     def behind(stage: str) -> Iterator[str]:
         wanted = cells if stage in stages else ()

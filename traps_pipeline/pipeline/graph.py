@@ -14,14 +14,14 @@ from typing import Any, Literal
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.pipeline.partitioning import EVERY, SAME, KeyMapping, Scheme
-from traps_pipeline.pipeline.wanted import Wanted
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.pipeline.partitioning import EVERY, SAME, KeyMapping, Partitioning
+from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 Node = tuple[str, str | None]  # stage or source, and its partition key
-Need = Literal["every", "some", "none"]
+UpstreamPolicy = Literal["every", "some", "none"]
 Cost = Literal["", "money", "machine"]
 # Each job and the groups of assets that it makes. Every group stands here once, in the order in which groups are made.
 JOB_GROUPS: Mapping[str, tuple[str, ...]] = {
@@ -43,7 +43,7 @@ class Check:
 
     name: str
     doc: str
-    wrong: Callable[[Workspace, str | None, Made], Any]
+    wrong: Callable[[Workspace, str | None, StageOutput], Any]
     blocks: bool = True
 
 
@@ -54,7 +54,7 @@ class Parent:
 
     name: str
     mapping: KeyMapping | None = None
-    need: Need = "every"
+    need: UpstreamPolicy = "every"
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class Source:
     group: str
     doc: str
     kinds: Sequence[str]
-    scheme: Scheme | None = None
+    scheme: Partitioning | None = None
 
 
 @dataclass(frozen=True)
-class Takes:
+class RunResources:
     """What a run of a stage takes of a host, for a cluster to set aside. memory_gb: 0 where it does not matter.
     each_gb: of a stage that works on all cores that it is given (`traps run --cpus`), the memory of each besides; 0: it
     works on one. A stage whose cost is `machine` takes a GPU besides, where `traps run --gpus` says so."""
@@ -84,7 +84,7 @@ def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
 
 
 @dataclass(frozen=True)
-class Shared:
+class ConcurrentBuild:
     """How several runs make one partition: the files that it names beside one another, and then one of them the
     partition, which the others take over as made. files: makes what nobody else is at, then waits, if it is told to,
     until nothing is missing; what was done here, and whether all is there. seconds: about how long one core works at
@@ -98,10 +98,10 @@ class Shared:
 class Collect:
     """Makes several partitions side by side, and hands each on when it is done."""
 
-    partitions: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]]
+    partitions: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, StageOutput]]]
 
 
-Make = Callable[[Workspace, Any], Made]  # makes one partition
+Make = Callable[[Workspace, Any], StageOutput]  # makes one partition
 
 
 @dataclass(frozen=True)
@@ -119,21 +119,21 @@ class Stage:
     group: str
     parents: Mapping[str, Parent]
     doc: str
-    scheme: Scheme | None
+    scheme: Partitioning | None
     checks: Sequence[Check]
     kinds: Sequence[str]
     code: str
     cost: Cost
-    wants: Callable[[Wanted, Any], bool]
+    wants: Callable[[StudyPartitions, Any], bool]
     lost: Callable[[Workspace, Any], list[str]]
-    takes: Takes = Takes()
-    shared: Shared | None = None
+    takes: RunResources = RunResources()
+    shared: ConcurrentBuild | None = None
 
     def columns(self, key: str | None) -> Mapping[str, Any]:
         """Values of the table's partition columns for a key."""
         return {} if self.scheme is None or key is None else self.scheme.columns(key)
 
-    def wanted(self, wanted: Wanted) -> list[str | None]:
+    def wanted(self, wanted: StudyPartitions) -> list[str | None]:
         """The keys that a study wants, in key order."""
         keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(wanted)
         return [key for key in keys if self.wants(wanted, key)]

@@ -17,7 +17,7 @@ from typing import Literal
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.pipeline.graph import Graph, Stage, name_of, the_graph
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace
 
@@ -45,7 +45,7 @@ class Lineage:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
         workspace.store.look()
         self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
-        self._wanted = cache(lambda name: {*self.graph[name].wanted(Wanted(workspace))})
+        self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
         """Versions of everything that is there to make a partition from, by name."""

@@ -13,7 +13,7 @@ from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.scenes.picture.trial import check_rendering, opengl_variables
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
@@ -31,11 +31,11 @@ Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a ru
 
 def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
     """Return what a study wants of these stages, or one experiment of it."""
-    wanted = Wanted(workspace, experiment)
+    wanted = StudyPartitions(workspace, experiment)
     return {stage.name: stage.wanted(wanted) for stage in the_graph().stages if stage.name in stages}
 
 
-def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, wanted: Wanted) -> Parts:
+def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, wanted: StudyPartitions) -> Parts:
     """Return the stages of a Dagster run that share a step's partitions, each with those that the study wants."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys

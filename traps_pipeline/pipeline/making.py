@@ -8,11 +8,11 @@ from contextlib import closing
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.workers import kept_workers
-from traps_pipeline.pipeline.graph import Collect, Make, Shared, Stage
+from traps_pipeline.pipeline.graph import Collect, ConcurrentBuild, Make, Stage
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.leases import alone
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 Inputs = Mapping[str | None, Mapping[str, str]]  # versions of what each partition is made from
@@ -31,7 +31,7 @@ class PartitionMaker:
         self.taken: dict[str | None, tuple[str, Tally]] = {}
         self._made_at: dict[str | None, int] = {}
 
-    def make(self, inputs: Inputs) -> Iterator[tuple[str | None, Made]]:
+    def make(self, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
         """Make a partition for each key of `inputs`, which were looked up before anything was read."""
         make, shared = self._stage.make, self._stage.shared
         if isinstance(make, Collect):
@@ -42,7 +42,7 @@ class PartitionMaker:
         else:
             yield from self._beside_others(make, shared, inputs)
 
-    def _side_by_side(self, make: Collect, keys: Sequence[str | None]) -> Iterator[tuple[str | None, Made]]:
+    def _side_by_side(self, make: Collect, keys: Sequence[str | None]) -> Iterator[tuple[str | None, StageOutput]]:
         pending = [*keys]
         try:
             for key, made in make.partitions(self._workspace, [str(key) for key in keys]) if keys else ():
@@ -51,7 +51,7 @@ class PartitionMaker:
         except TrapsError as error:
             self.unmade |= dict.fromkeys(pending, error)
 
-    def _one(self, make: Make, key: str | None, tally: Tally) -> Iterator[tuple[str | None, Made]]:
+    def _one(self, make: Make, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
         """Make one. tally: the work that was done for it before."""
         try:
             made = make(self._workspace, key)
@@ -63,7 +63,9 @@ class PartitionMaker:
 
     # --- beside other runs --------------------------------------------------------------------------------------------
 
-    def _beside_others(self, make: Make, shared: Shared, inputs: Inputs) -> Iterator[tuple[str | None, Made]]:
+    def _beside_others(
+        self, make: Make, shared: ConcurrentBuild, inputs: Inputs
+    ) -> Iterator[tuple[str | None, StageOutput]]:
         """Make files that no other run is at, then wait for theirs; who holds a partition's lease makes the partition,
         and the others take it over."""
         store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
@@ -85,7 +87,7 @@ class PartitionMaker:
                         if not self._takes_over(key, inputs[key], tally):
                             yield from self._one(make, key, tally)
 
-    def _make_files(self, shared: Shared, key: str | None, tally: Tally, *, wait: bool) -> bool:
+    def _make_files(self, shared: ConcurrentBuild, key: str | None, tally: Tally, *, wait: bool) -> bool:
         """Make files that a partition names, add what was done to the tally, and return whether all are there."""
         try:
             done, is_whole = shared.files(self._workspace, key, wait)

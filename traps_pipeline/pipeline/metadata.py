@@ -11,7 +11,7 @@ import dagster as dg
 from traps_pipeline.base.terminal import visible
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.previews import Markdown, Records, StudyFile
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -41,7 +41,7 @@ def visible_metadata(value: Any) -> Any:
     return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
 
 
-def partition_metadata(workspace: Workspace, stage: Stage, made: Made) -> dict[str, Any]:
+def partition_metadata(workspace: Workspace, stage: Stage, made: StageOutput) -> dict[str, Any]:
     """Return what Dagster shows of a partition or of files for people."""
     counts: dict[str, Any] = {name: count for name, count in vars(made.tally).items() if count}
     if stage.table is None:
@@ -52,7 +52,7 @@ def partition_metadata(workspace: Workspace, stage: Stage, made: Made) -> dict[s
     return {count: len(made.content), **counts, **preview(stage.table, made), **made.shown}
 
 
-def preview(table: Table, made: Made) -> dict[str, dg.TableMetadataValue]:
+def preview(table: Table, made: StageOutput) -> dict[str, dg.TableMetadataValue]:
     """Return rows without long texts by what they are: the best and worst where a table ranks, else the first.
 
     What a model wrote is shown on the report's pages, where it is escaped.

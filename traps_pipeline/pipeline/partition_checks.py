@@ -14,7 +14,7 @@ from traps_pipeline.pipeline.graph import Graph, Node, Stage, name_of
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.pipeline.translation import asset_key
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 CURRENT = "current"  # the check that every stage has
@@ -46,7 +46,7 @@ class StageChecks:
                     if damage := lineage.damage(parent, above):
                         yield _evaluation(parent, CURRENT, above, {"damaged": damage})
 
-    def of_made(self, key: str | None, made: Made) -> Iterator[dg.AssetCheckEvaluation]:
+    def of_made(self, key: str | None, made: StageOutput) -> Iterator[dg.AssetCheckEvaluation]:
         """Evaluate every check of a partition that was just written."""
         stage, wrong = self._stage, dict[str, Any]()
         if stage.table is not None:

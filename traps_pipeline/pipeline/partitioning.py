@@ -11,13 +11,13 @@ from functools import cached_property
 from itertools import product
 from typing import Any, Protocol
 
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 
 SEPARATOR = "|"  # between the two dimensions of a key, as Dagster writes it
 
 
 @dataclass(frozen=True, eq=False)
-class Scheme:
+class Partitioning:
     """One way of partitioning.
 
     dimensions: the keys of each dimension by its name, one or two, in the order of their names. columns: the values of
@@ -26,7 +26,7 @@ class Scheme:
 
     dimensions: Mapping[str, Sequence[str]]
     columns: Callable[[str], Mapping[str, Any]]
-    wanted: Callable[[Wanted], Sequence[str]]
+    wanted: Callable[[StudyPartitions], Sequence[str]]
 
     @cached_property
     def keys(self) -> Sequence[str]:
@@ -51,7 +51,7 @@ class Scheme:
 class KeyMapping(Protocol):
     """Says which partitions of a parent one is made from."""
 
-    def above(self, key: str | None, below: Scheme | None, above: Scheme) -> Sequence[str]:
+    def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """Return the parent's keys for a key of the stage below (None where that has no partitions)."""
         ...
 
@@ -60,7 +60,7 @@ class KeyMapping(Protocol):
 class Every:
     """Every partition of the parent."""
 
-    def above(self, key: str | None, below: Scheme | None, above: Scheme) -> Sequence[str]:
+    def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
         return above.keys
 
@@ -69,7 +69,7 @@ class Every:
 class Same:
     """The partition of the same key."""
 
-    def above(self, key: str | None, below: Scheme | None, above: Scheme) -> Sequence[str]:
+    def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
         return [key] if key in above.known and key is not None else []
 
@@ -83,7 +83,7 @@ class ByDimension:
 
     name: str
 
-    def above(self, key: str | None, below: Scheme | None, above: Scheme) -> Sequence[str]:
+    def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
         assert key is not None and below is not None, "both sides have partitions"
         if len(above.dimensions) == 1:
@@ -98,7 +98,7 @@ class Pairs:
 
     below: Mapping[str, Sequence[str]]
 
-    def above(self, key: str | None, below: Scheme | None, above: Scheme) -> Sequence[str]:
+    def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
         return [one for one, made in self.below.items() if key in made]
 
@@ -109,6 +109,6 @@ class These:
 
     keys: Sequence[str]
 
-    def above(self, key: str | None, below: Scheme | None, above: Scheme) -> Sequence[str]:
+    def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
         return self.keys

@@ -1,6 +1,6 @@
 """What a stage wants people to see of a partition beside its rows; `metadata` puts it into Dagster's words.
 
-A `Made.shown` holds plain values, texts and these.
+A `StageOutput.shown` holds plain values, texts and these.
 """
 
 from __future__ import annotations

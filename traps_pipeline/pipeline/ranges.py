@@ -11,7 +11,7 @@ from itertools import groupby
 
 import numpy as np
 
-from traps_pipeline.pipeline.partitioning import Scheme
+from traps_pipeline.pipeline.partitioning import Partitioning
 
 Range = tuple[str | None, str | None]  # first and last key
 _Corners = tuple[int, int, int, int]  # first and last row, first and last column
@@ -26,7 +26,7 @@ class _Grid:
     columns: Sequence[str]
 
     @staticmethod
-    def of(scheme: Scheme) -> _Grid:
+    def of(scheme: Partitioning) -> _Grid:
         *rows, columns = scheme.dimensions.values()
         return _Grid(rows[0] if rows else [""], columns)
 
@@ -43,7 +43,7 @@ class _Grid:
         return "|".join(filter(None, first)), "|".join(filter(None, last))
 
 
-def batches(scheme: Scheme | None, keys: Sequence[str | None]) -> Iterator[Range]:
+def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator[Range]:
     """As few ranges as there can be that together are exactly the keys."""
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
@@ -71,7 +71,7 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 # --- for several hosts ------------------------------------------------------------------------------------------------
 
 
-def cut(scheme: Scheme | None, keys: Sequence[str | None], most: int) -> list[Range]:
+def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
     """So many ranges, or one for each key where there are fewer, that have about as many of the keys each and none
     twice, whatever is missing between them: a range may hold other keys. Cells of one model stay together where there
     are fewer runs than models, since each run loads its models anew; elsewhere those of one evaluation do."""
@@ -124,7 +124,7 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
 
 
 def shared_out(
-    scheme: Scheme | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
+    scheme: Partitioning | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
 ) -> list[Range]:
     """Ranges of runs that share what is to be made of each key. seconds: of work of such a run. There are so many runs,
     of `most`, that each finds enough to do. As long as they are no more than the keys, each goes through all of them;

@@ -24,14 +24,14 @@ from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host
 from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
 
 
 @dataclass
 class WalkResult:
-    """What a walk did: problems in sentences, among them checks that do not pass; whether a budget ended it."""
+    """What a pass over the stages did: problems in sentences, among them checks that do not pass; whether a budget ended it."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -123,7 +123,7 @@ def _alive(pid: int) -> bool:
 
 
 def pending_in(
-    block: Sequence[Stage], lineage: Lineage, history: History, wanted: Wanted, *, existing: bool = False
+    block: Sequence[Stage], lineage: Lineage, history: History, wanted: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
     """Return the stages of a block that have something to make, or stand below one that has, and the keys of these.
 
@@ -141,7 +141,7 @@ def pending_in(
     return [lineage.graph[name] for name in pending], [k for k in every if any(k in keys for keys in pending.values())]
 
 
-def walk(
+def materialize_stale(
     instance: dg.DagsterInstance,
     runs: Runs,
     workspace: Workspace,
@@ -154,7 +154,7 @@ def walk(
     experiment: only what that one of the study's wants. KeyboardInterrupt passes through.
     """
     outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
-    history, wanted = History(instance, graph), Wanted(workspace, experiment)
+    history, wanted = History(instance, graph), StudyPartitions(workspace, experiment)
     tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():
         for block in graph.blocks([name for name in stages if graph[name].wanted(wanted)]):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from traps_pipeline.pipeline.partitioning import ByDimension, Pairs, Scheme, These
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.partitioning import ByDimension, Pairs, Partitioning, These
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
 
@@ -16,7 +16,7 @@ def study_here() -> Workspace | None:
     return Workspace.open(place) if Workspace.is_there(place) else None
 
 
-_HERE = Wanted(study_here())
+_HERE = StudyPartitions(study_here())
 
 
 # Groups of assets that the study has no use for: Dagster does not show them, and nothing is made of them.
@@ -24,32 +24,32 @@ LEFT_OUT = frozenset(
     group for group, used in (("mechanism", _HERE.looks_inside), ("arms", bool(_HERE.arms))) if not used
 )
 
-CATEGORY = Scheme({"category": _HERE.categories}, lambda key: {"category": key}, lambda wanted: wanted.categories)
-DATASET = Scheme({"dataset": _HERE.datasets}, lambda key: {"dataset": key}, lambda wanted: wanted.datasets)
-EVALUATION = Scheme(
+CATEGORY = Partitioning({"category": _HERE.categories}, lambda key: {"category": key}, lambda wanted: wanted.categories)
+DATASET = Partitioning({"dataset": _HERE.datasets}, lambda key: {"dataset": key}, lambda wanted: wanted.datasets)
+EVALUATION = Partitioning(
     {"evaluation": [e.key for e in _HERE.evaluations]},
     lambda key: {},
     lambda wanted: [e.key for e in wanted.evaluations],
 )
-CELL = Scheme(
+CELL = Partitioning(
     {**DATASET.dimensions, **EVALUATION.dimensions},
     lambda key: Cell.parse(key).partition,
     lambda wanted: wanted.cells,
 )
 # Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
-PROBED = Scheme({"dataset": _HERE.probed}, lambda key: {"dataset": key}, lambda wanted: wanted.probed)
-EXTRACTION = Scheme(
+PROBED = Partitioning({"dataset": _HERE.probed}, lambda key: {"dataset": key}, lambda wanted: wanted.probed)
+EXTRACTION = Partitioning(
     {"extraction": [e.key for e in _HERE.extractions]},
     lambda key: Extraction.parse(key).partition,
     lambda wanted: [e.key for e in wanted.extractions],
 )
-STATES = Scheme(
+STATES = Partitioning(
     {**PROBED.dimensions, **EXTRACTION.dimensions},
     lambda key: StatesCell.parse(key).partition,
     lambda wanted: wanted.states,
 )
-STEERED = Scheme({"steering": _HERE.steered}, lambda key: {}, lambda wanted: wanted.steered)
-STEERING = Scheme(
+STEERED = Partitioning({"steering": _HERE.steered}, lambda key: {}, lambda wanted: wanted.steered)
+STEERING = Partitioning(
     {**DATASET.dimensions, **STEERED.dimensions},
     lambda key: SteeringCell.parse(key).partition,
     lambda wanted: wanted.steering,
@@ -61,12 +61,12 @@ by_extraction = ByDimension("extraction")
 by_steering = ByDimension("steering")
 
 
-def to_keys(above: Scheme, below: Scheme, mapping: Callable[[str], Iterable[str]]) -> Pairs:
+def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], Iterable[str]]) -> Pairs:
     """What partitions below are made from each above, of the keys that the study has."""
     pairs = {key: sorted(below.known & {*mapping(key)}) for key in sorted(above.known)}
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 
 
-def these_keys(above: Scheme, keys: Iterable[str]) -> These:
+def these_keys(above: Partitioning, keys: Iterable[str]) -> These:
     """Of all partitions above these, as far as the study has them."""
     return These([key for key in keys if key in above.known])

@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.pipeline.graph import name_of, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
 
 _NOTE = "last_run.json"
@@ -36,7 +36,7 @@ def stages_until(until: str | None) -> set[str]:
 
 def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
     """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
-    wanted, graph = Wanted(workspace, experiment), the_graph()
+    wanted, graph = StudyPartitions(workspace, experiment), the_graph()
     if not wanted.cells and not wanted.states:
         raise TrapsError(
             f"experiment {experiment} asks nothing: none of its scenarios belongs to its datasets, or no model has its "
@@ -48,7 +48,7 @@ def require_work(workspace: Workspace, experiment: str, until: str | None) -> No
 
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     """Checks of what is wanted that do not pass, whichever run made it."""
-    wanted, problems = Wanted(workspace, experiment), []
+    wanted, problems = StudyPartitions(workspace, experiment), []
     for stage in the_graph().stages:
         for key in stage.wanted(wanted):
             for check in workspace.failed_checks(stage.name, key):
@@ -68,7 +68,7 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
     """Write down, after a run without problems, which versions Dagster's history holds, and what state it is in."""
     if (history := _history_state(workspace)) is None:
         return
-    lineage, wanted = Lineage(workspace), Wanted(workspace, experiment)
+    lineage, wanted = Lineage(workspace), StudyPartitions(workspace, experiment)
     graph = lineage.graph
     versions = {
         name_of((name, key)): lineage.version(name, key)
@@ -87,7 +87,7 @@ def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: 
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
-    lineage, wanted, known = Lineage(workspace), Wanted(workspace, experiment), note["versions"]
+    lineage, wanted, known = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
     return all(
         known.get(name_of((name, key))) == lineage.version(name, key) is not None
         and lineage.status(name, key).kind == "fresh"

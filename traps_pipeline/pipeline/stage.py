@@ -15,18 +15,18 @@ from traps_pipeline.pipeline.graph import (
     GROUPS,
     Check,
     Collect,
+    ConcurrentBuild,
     Cost,
     Make,
-    Need,
     Parent,
-    Shared,
+    RunResources,
     Source,
     Stage,
-    Takes,
+    UpstreamPolicy,
 )
-from traps_pipeline.pipeline.partitioning import KeyMapping, Scheme
+from traps_pipeline.pipeline.partitioning import KeyMapping, Partitioning
 from traps_pipeline.pipeline.schemes import LEFT_OUT
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -50,7 +50,7 @@ def is_declared(name: str) -> bool:
     return name in DECLARED
 
 
-def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: Need = "every") -> Parent:
+def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: UpstreamPolicy = "every") -> Parent:
     """Return a parent of a stage, by which of its partitions and how much of them it needs."""
     return Parent(parent if isinstance(parent, str) else parent.name, mapping, need)
 
@@ -62,7 +62,7 @@ def source(
     group: str,
     doc: str,
     kinds: Sequence[str],
-    scheme: Scheme | None = None,
+    scheme: Partitioning | None = None,
 ) -> Source:
     """Declare something that people edit; its data version, by partition where it has any, is made from its content."""
     one = Source(name, version, group, doc, kinds, scheme)
@@ -76,15 +76,15 @@ def stage(
     *,
     group: str,
     parents: Sequence[Parent | Stage | Source],
-    scheme: Scheme | None = None,
+    scheme: Partitioning | None = None,
     code: str = "",
     cost: Cost = "",
     checks: Sequence[Check] = (),
     kinds: Collection[str] = ("parquet",),
-    wants: Callable[[Wanted, Any], bool] = lambda wanted, key: True,
+    wants: Callable[[StudyPartitions, Any], bool] = lambda wanted, key: True,
     lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
-    takes: Takes | None = None,
-    shared: Shared | None = None,
+    takes: RunResources | None = None,
+    shared: ConcurrentBuild | None = None,
 ) -> Stage:
     """Declare a table, or files for people where only a name is given (see `graph.Stage` for the parameters).
 
@@ -106,7 +106,7 @@ def stage(
         cost=cost,
         wants=wants,
         lost=lost,
-        takes=takes or Takes(),
+        takes=takes or RunResources(),
         shared=shared,
     )
     _declare(one)

@@ -29,8 +29,8 @@ from traps_pipeline.pipeline.machine import parts_of_run, require_machine, why_n
 from traps_pipeline.pipeline.making import PartitionMaker
 from traps_pipeline.pipeline.metadata import partition_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
-from traps_pipeline.pipeline.wanted import Wanted
-from traps_pipeline.storage.parquet import Made, State
+from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.storage.parquet import StageOutput, State
 from traps_pipeline.storage.workspace import Workspace
 
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
@@ -77,7 +77,7 @@ class _Step:
         self.tags = context.run.tags
         if context.run.run_id not in _ATTEMPTS:
             _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
-        wanted = Wanted(workspace, self.tags.get(EXPERIMENT_TAG))
+        wanted = StudyPartitions(workspace, self.tags.get(EXPERIMENT_TAG))
         require_machine(workspace, parts_of_run(context, stage, wanted))
         self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
         self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
@@ -117,13 +117,13 @@ class _Step:
         else:
             self._inputs[key] = self.lineage.inputs(self.stage.name, key)
 
-    def make(self) -> Iterator[tuple[str | None, Made]]:
+    def make(self) -> Iterator[tuple[str | None, StageOutput]]:
         """Make what was admitted."""
         if self._inputs:
             progress.current().stage(self.stage.name, len(self._inputs))
         return self._maker.make(self._inputs)
 
-    def write(self, key: str | None, made: Made) -> str:
+    def write(self, key: str | None, made: StageOutput) -> str:
         """Write what was made; return its data version."""
         stage, inputs, content = self.stage, self._inputs[key], made.content
         if stage.table is not None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -30,7 +30,7 @@ class StageStatus:
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
     """Yield the status of every stage, over the partitions that the study wants, or one of its experiments."""
-    wanted = Wanted(workspace, experiment)
+    wanted = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(wanted)}
         stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}

@@ -10,7 +10,7 @@ from pathlib import Path
 import dagster as dg
 
 from traps_pipeline.pipeline.graph import Graph
-from traps_pipeline.pipeline.partitioning import ByDimension, KeyMapping, Pairs, Same, Scheme, These
+from traps_pipeline.pipeline.partitioning import ByDimension, KeyMapping, Pairs, Partitioning, Same, These
 from traps_pipeline.pipeline.schemes import study_here
 
 # Partition mappings over one dimension, observable sources and backfill policies are in beta, partitioned checks in
@@ -35,7 +35,7 @@ def _prefix() -> tuple[str, ...]:
 
 
 @cache
-def partitions_of(scheme: Scheme) -> dg.PartitionsDefinition:
+def partitions_of(scheme: Partitioning) -> dg.PartitionsDefinition:
     """The partitions of a scheme, the same object for the same one."""
     parts = {name: dg.StaticPartitionsDefinition([*keys]) for name, keys in scheme.dimensions.items()}
     return next(iter(parts.values())) if len(parts) == 1 else dg.MultiPartitionsDefinition(parts)

@@ -30,7 +30,7 @@ from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 
 
-class Wanted:
+class StudyPartitions:
     """The keys of every kind of partition that a study wants, in key order.
 
     workspace: None for all that the registry has, which is what is shown where there is no study yet. experiment: the

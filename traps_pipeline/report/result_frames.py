@@ -63,7 +63,7 @@ SUB_COLUMNS = (
 Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the results, by the name of the frame they make
 
 
-class Made:
+class LazyFrame:
     """A frame of `Results`, made when it is first read: by the results' own maker of that name if there is one, else by
     `derive` from the other frames, else it has the rows of `table`."""
 
@@ -102,65 +102,73 @@ class Results:
     makers: ClassVar[Makers] = {}
     mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
-    board = Made(table=LEADERBOARD)
-    cells = Made("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
-    overall = Made(
+    board = LazyFrame(table=LEADERBOARD)
+    cells = LazyFrame("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
+    overall = LazyFrame(
         "One row per (model, regime) that has all four datasets: the columns of cells without dataset, and j; a study's"
         " rows also have j_std, the intervals and ranks of LEADERBOARD. epoch joins the datasets' epochs by +."
     )
-    rates = Made("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
-    sub_scenarios = Made("SUB_COLUMNS: means over models, one row per sub-scenario.")
-    sub_cells = Made("One row per (model, dataset, regime) and sub-scenario (column scope).")
-    labels = Made("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
-    agreement = Made(table=AGREEMENT)
-    bias = Made(table=JUDGE_BIAS)
-    leave_one_out = Made(table=LEAVE_ONE_OUT)
-    robust = Made(table=ROBUST)
-    hypotheses = Made(table=HYPOTHESES)
-    contrasts = Made(table=CONTRASTS)
-    regime_tests = Made(table=REGIME_TESTS)
-    confabulation = Made(table=CONFABULATION_PREVALENCE)
-    validation = Made(table=JUDGE_VALIDATION)
-    human_row = Made(table=HUMAN_ROW)
-    human_agreement = Made(table=HUMAN_AGREEMENT)
-    panel_errors = Made(table=PANEL_ERRORS)
-    corrected = Made(table=CORRECTED)
-    composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
-    prompted_probes = Made("PROBES rows under every prompt.", table=PROBES)
-    prompted_baselines = Made("PROBE_BASELINES rows under every prompt.", table=PROBE_BASELINES)
-    probes = Made(
+    rates = LazyFrame(
+        "RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled)."
+    )
+    sub_scenarios = LazyFrame("SUB_COLUMNS: means over models, one row per sub-scenario.")
+    sub_cells = LazyFrame("One row per (model, dataset, regime) and sub-scenario (column scope).")
+    labels = LazyFrame(
+        "Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models."
+    )
+    agreement = LazyFrame(table=AGREEMENT)
+    bias = LazyFrame(table=JUDGE_BIAS)
+    leave_one_out = LazyFrame(table=LEAVE_ONE_OUT)
+    robust = LazyFrame(table=ROBUST)
+    hypotheses = LazyFrame(table=HYPOTHESES)
+    contrasts = LazyFrame(table=CONTRASTS)
+    regime_tests = LazyFrame(table=REGIME_TESTS)
+    confabulation = LazyFrame(table=CONFABULATION_PREVALENCE)
+    validation = LazyFrame(table=JUDGE_VALIDATION)
+    human_row = LazyFrame(table=HUMAN_ROW)
+    human_agreement = LazyFrame(table=HUMAN_AGREEMENT)
+    panel_errors = LazyFrame(table=PANEL_ERRORS)
+    corrected = LazyFrame(table=CORRECTED)
+    composition = LazyFrame("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
+    prompted_probes = LazyFrame("PROBES rows under every prompt.", table=PROBES)
+    prompted_baselines = LazyFrame("PROBE_BASELINES rows under every prompt.", table=PROBE_BASELINES)
+    probes = LazyFrame(
         "PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.",
         derive=lambda results: _of_probe_prompt(results.prompted_probes),
     )
-    cosines = Made("COSINES rows at the steered layer of each model.")
-    effects = Made("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
-    baselines = Made(
+    cosines = LazyFrame("COSINES rows at the steered layer of each model.")
+    effects = LazyFrame(
+        "STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label."
+    )
+    baselines = LazyFrame(
         "PROBE_BASELINES rows under PROBE_PROMPT.", derive=lambda results: _of_probe_prompt(results.prompted_baselines)
     )
-    gate = Made(table=GATE)
-    risk_coverage = Made(table=RISK_COVERAGE)
-    patching = Made(table=PATCHING)
-    own_effects = Made(
+    gate = LazyFrame(table=GATE)
+    risk_coverage = LazyFrame(table=RISK_COVERAGE)
+    patching = LazyFrame(table=PATCHING)
+    own_effects = LazyFrame(
         "STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.",
         derive=lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)),
     )
-    nulls = Made(table=STEERING_NULLS)
-    steering_pecs = Made(table=STEERING_PECS)
-    shares = Made(table=STEERING_SHARES)
-    steering_regimes = Made(
+    nulls = LazyFrame(table=STEERING_NULLS)
+    steering_pecs = LazyFrame(table=STEERING_PECS)
+    shares = LazyFrame(table=STEERING_SHARES)
+    steering_regimes = LazyFrame(
         "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
     )
-    lens = Made(table=LENS)
-    sentences = Made(table=SENTENCES)
-    item_scores = Made("ITEM_SCORES rows under PROBE_PROMPT.", table=ITEM_SCORES)
-    steering_families = Made(
+    lens = LazyFrame(table=LENS)
+    sentences = LazyFrame(table=SENTENCES)
+    item_scores = LazyFrame("ITEM_SCORES rows under PROBE_PROMPT.", table=ITEM_SCORES)
+    steering_families = LazyFrame(
         "Rows of `mechanism.effects.family_asymmetry`.",
         derive=lambda results: effects.family_asymmetry(results.effects),
     )
-    steering_domains = Made(
+    steering_domains = LazyFrame(
         "Rows of `mechanism.effects.domains`.", derive=lambda results: effects.domains(results.effects)
     )
-    steering_layers = Made("Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects))
+    steering_layers = LazyFrame(
+        "Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects)
+    )
 
     def __init__(self) -> None:
         self.made: dict[str, pd.DataFrame] = {}

@@ -14,7 +14,15 @@ from traps_pipeline.mechanism.shares import of_paper
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
-from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
+from traps_pipeline.report.result_frames import (
+    CELL_COLUMNS,
+    RATE_COLUMNS,
+    SUB_COLUMNS,
+    LazyFrame,
+    Makers,
+    Results,
+    joined,
+)
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs
@@ -121,7 +129,7 @@ class StudyResults(Results):
 
     source = "this study"
     is_study = True
-    metrics = Made("METRICS rows of the pairs; arms enter no table or figure.")
+    metrics = LazyFrame("METRICS rows of the pairs; arms enter no table or figure.")
     makers: ClassVar[Makers] = {
         "metrics": lambda results: _of_panel(results, results.tables.read_all(METRICS, dataset=DATASETS)),
         "cells": _cells,

@@ -15,7 +15,7 @@ from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.forecast import Experience, forecast
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, load_models
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.workspace import Workspace
@@ -90,7 +90,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
     """Model, dataset of the taxonomy, and how many evaluations the study's experiments ask of it."""
-    cells = [Cell.parse(key) for key in Wanted(workspace).cells]
+    cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)
 

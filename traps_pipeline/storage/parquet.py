@@ -46,7 +46,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Made:
+class StageOutput:
     """What a stage has made of a partition, before it is written: a table's rows or files by path, what they took, what
     else a person wants to see of them, and what their checks look at beside them."""
 
@@ -65,14 +65,14 @@ class Made:
         return cast("pd.DataFrame", self.content)
 
 
-def joined(parts: Sequence[Made]) -> Made:
+def joined(parts: Sequence[StageOutput]) -> StageOutput:
     """What parts of a partition were made of, as one: rows, tallies and numbers shown are added up."""
     first, *others = parts
     for other in others:
         first.tally.add(other.tally)
     rows = [row for part in parts for row in part.content]
     shown = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
-    return Made(rows, first.tally, shown, first.beside)
+    return StageOutput(rows, first.tally, shown, first.beside)
 
 
 class TableStore:

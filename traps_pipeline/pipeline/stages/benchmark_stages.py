@@ -8,16 +8,16 @@ from traps_pipeline.base.progress import Tally
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
 from traps_pipeline.benchmark.videos import missing_clips
-from traps_pipeline.pipeline.graph import Check, Shared, Takes
+from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.pipeline.stage import is_declared, of, source, stage
 from traps_pipeline.protocol.datasets import all_datasets_of, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "benchmark"
-RENDERS = Takes(memory_gb=0.6, each_gb=0.4)  # measured: 0.4 GB of the process, 0.35 of each that draws
+RENDERS = RunResources(memory_gb=0.6, each_gb=0.4)  # measured: 0.4 GB of the process, 0.35 of each that draws
 released_specs = source(
     "released_specs",
     released_version,
@@ -38,15 +38,15 @@ category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
 category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonomy_of_category(category)))
 
 
-def _make_specs(workspace: Workspace, category: str) -> Made:
+def _make_specs(workspace: Workspace, category: str) -> StageOutput:
     """Scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated here,
     once."""
     rows, resolved = build_specs(workspace, category)
-    return Made(rows, beside=resolved)
+    return StageOutput(rows, beside=resolved)
 
 
-def _evidence(find: str) -> Callable[[Workspace, str | None, Made], Any]:
-    def wrong(workspace: Workspace, key: str | None, made: Made) -> Any:
+def _evidence(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
+    def wrong(workspace: Workspace, key: str | None, made: StageOutput) -> Any:
         from traps_pipeline.benchmark import stored_evidence as evidence
 
         return getattr(evidence, find)([item.spec for item in made.beside])
@@ -62,7 +62,7 @@ scene_specs = stage(
     scheme=CATEGORY,
     code="4",
     kinds=["parquet", "mujoco"],
-    shared=Shared(seconds=seconds_left),
+    shared=ConcurrentBuild(seconds=seconds_left),
     checks=[
         Check(
             "outcome_settled",
@@ -102,13 +102,13 @@ scene_specs = stage(
 )
 
 
-def _make_videos(workspace: Workspace, category: str) -> Made:
+def _make_videos(workspace: Workspace, category: str) -> StageOutput:
     """Control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
     whichever of the processes that are at it."""
     from traps_pipeline.benchmark.videos import build_videos
 
     rows, leaks = build_videos(workspace, category)
-    return Made(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
+    return StageOutput(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
 
 
 def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
@@ -124,7 +124,7 @@ def _to_render_s(workspace: Workspace, category: str) -> float:
     return seconds_left(workspace, category)
 
 
-def _alike(workspace: Workspace, key: str | None, made: Made) -> list[str]:
+def _alike(workspace: Workspace, key: str | None, made: StageOutput) -> list[str]:
     shown = Counter((row.side, row.frames_sha256) for row in made.rows(VIDEOS))
     return [row.path for row in made.rows(VIDEOS) if shown[row.side, row.frames_sha256] > 1]
 
@@ -138,7 +138,7 @@ videos = stage(
     code="3",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
-    shared=Shared(_render, _to_render_s),
+    shared=ConcurrentBuild(_render, _to_render_s),
     lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in missing_clips(workspace, str(key))],
     checks=[
         Check(
@@ -151,13 +151,13 @@ videos = stage(
 )
 
 
-def _make_arms(workspace: Workspace, category: str) -> Made:
+def _make_arms(workspace: Workspace, category: str) -> StageOutput:
     """The arms and variations of a category's scenarios that the study asks: clips and questions beside the pairs."""
     from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
-    return Made(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
+    return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
 
 
 def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
@@ -188,21 +188,21 @@ arms = stage(
     code="3",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
-    shared=Shared(_film, _to_film_s),
+    shared=ConcurrentBuild(_film, _to_film_s),
     wants=lambda wanted, key: bool({*wanted.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
     lost=lambda workspace, key: _unmade_arms(workspace, str(key)),
 )
 
 
-def _make_items(workspace: Workspace, dataset: str) -> Made:
+def _make_items(workspace: Workspace, dataset: str) -> StageOutput:
     """The items that models are asked, two per pair: the control, and the void that differs from it by one change."""
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)
-    return Made(rows, shown={"benchmark version": rows[0].benchmark_version})
+    return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})
 
 
-def _odd_pairs(workspace: Workspace, key: str | None, made: Made) -> dict[str, list[str]]:
+def _odd_pairs(workspace: Workspace, key: str | None, made: StageOutput) -> dict[str, list[str]]:
     sides: dict[str, list[str]] = {}
     for row in made.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)

@@ -19,7 +19,7 @@ from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "evaluation"
@@ -52,21 +52,23 @@ judges = source(
 )
 
 
-def _collect_answers(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+def _collect_answers(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Answers of a model under a regime in a run, one row per item; answers in the ledger are not asked again."""
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 
-def _collect_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+def _collect_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 
-def _with_items(workspace: Workspace, cells: Iterator[tuple[Cell, Made]]) -> Iterator[tuple[str | None, Made]]:
+def _with_items(
+    workspace: Workspace, cells: Iterator[tuple[Cell, StageOutput]]
+) -> Iterator[tuple[str | None, StageOutput]]:
     """Add a cell's items to what is shown of it."""
     for cell, made in cells:
         shown = {**made.shown, **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], made.content))}
-        yield cell.key, Made(made.content, made.tally, shown)
+        yield cell.key, StageOutput(made.content, made.tally, shown)
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
@@ -84,7 +86,7 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **why}
 
 
-def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
+def _answers_missing(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
     n_items = state.rows if state else 0
     n_rows = len(made.rows(RESPONSES))
@@ -107,7 +109,7 @@ responses = stage(
 )
 
 
-def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
+def _many_invalid(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     cast_votes = made.rows(VOTES)
     invalid = sum(not vote.valid for vote in cast_votes)
     many = invalid > MAX_INVALID_SHARE * len(cast_votes)
@@ -133,15 +135,15 @@ votes = stage(
 )
 
 
-def _make_verdicts(workspace: Workspace, key: str) -> Made:
+def _make_verdicts(workspace: Workspace, key: str) -> StageOutput:
     """The verdict of the panel's majority on each item of a cell."""
     from traps_pipeline.judging.verdicts import decide_cell
 
     rows = decide_cell(workspace, Cell.parse(key))
-    return Made(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
+    return StageOutput(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
 
 
-def _verdicts_missing(workspace: Workspace, key: str | None, made: Made) -> str:
+def _verdicts_missing(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
     n_answers = answered.rows if answered else 0
     return "" if n_answers == len(made.frame) else f"{len(made.frame)} verdicts for {n_answers} answers"

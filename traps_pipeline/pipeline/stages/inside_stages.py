@@ -32,11 +32,11 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steers,
 )
 from traps_pipeline.pipeline.stages.tables_shown import made_of
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -78,11 +78,11 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
     return model, StoredStates.of(workspace, extraction)
 
 
-def _make_baselines(workspace: Workspace, key: str) -> Made:
+def _make_baselines(workspace: Workspace, key: str) -> StageOutput:
     """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
     from traps_pipeline.mechanism.baselines import baseline_rows
 
-    return Made(baseline_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
 
 
 probe_baselines = stage(
@@ -103,22 +103,22 @@ probe_baselines = stage(
 )
 
 
-def _make_gate(workspace: Workspace, key: str) -> Made:
+def _make_gate(workspace: Workspace, key: str) -> StageOutput:
     """The model's figures before and after a probe on its states has turned answers into abstentions, beside gates on
     raw inputs, on the output margin and with shuffled labels."""
     from traps_pipeline.mechanism.gating import gate_rows
 
-    return Made(gate_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(gate_rows(workspace, *_examined(workspace, key)))
 
 
-def _make_curves(workspace: Workspace, key: str) -> Made:
+def _make_curves(workspace: Workspace, key: str) -> StageOutput:
     """Risk against coverage as gates give up answers, over the four datasets."""
     from traps_pipeline.mechanism.gating import curve_rows
 
-    return Made(curve_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
 
 
-def _gated(wanted: Wanted, key: str) -> bool:
+def _gated(wanted: StudyPartitions, key: str) -> bool:
     """Whether the model of an extraction is asked, so that there are answers to gate."""
     extraction = Extraction.parse(key)
     asked = {(e.model, e.regime) for e in wanted.evaluations}
@@ -146,11 +146,11 @@ gate = _stage_of_gates(GATE, _make_gate)
 risk_coverage = _stage_of_gates(RISK_COVERAGE, _make_curves)
 
 
-def _make_lens(workspace: Workspace, key: str) -> Made:
+def _make_lens(workspace: Workspace, key: str) -> StageOutput:
     """The output margin of stored states at every layer, through the model's final norm and head."""
     from traps_pipeline.mechanism.lens import lens_rows
 
-    return Made(lens_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(lens_rows(workspace, *_examined(workspace, key)))
 
 
 lens = stage(
@@ -163,11 +163,11 @@ lens = stage(
 )
 
 
-def _make_item_scores(workspace: Workspace, key: str) -> Made:
+def _make_item_scores(workspace: Workspace, key: str) -> StageOutput:
     """What states and output say of each item, by probes that have not seen its scenario, beside its verdicts."""
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
-    return Made(item_score_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
 
 
 item_scores = stage(
@@ -186,14 +186,14 @@ item_scores = stage(
 )
 
 
-def _make_sentences(workspace: Workspace, key: str) -> Made:
+def _make_sentences(workspace: Workspace, key: str) -> StageOutput:
     """How likely whole abstentions are to a model behind every item, beside its own answers."""
     from traps_pipeline.mechanism.sentences import sentence_rows
 
-    return Made(sentence_rows(workspace, *_model(workspace, key)))
+    return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
 
 
-def _read_in_sentences(wanted: Wanted, key: str) -> bool:
+def _read_in_sentences(wanted: StudyPartitions, key: str) -> bool:
     extraction = Extraction.parse(key)
     asked = {(e.model, e.regime) for e in wanted.evaluations}
     return wanted.reads_sentences and (extraction.model, extraction.prompt) in asked
@@ -210,11 +210,11 @@ sentences = stage(
 )
 
 
-def _make_patching(workspace: Workspace, key: str) -> Made:
+def _make_patching(workspace: Workspace, key: str) -> StageOutput:
     """Indirect effects of groups of positions between matched controls and voids, at every layer, beside nulls."""
     from traps_pipeline.mechanism.patched import patching_rows
 
-    return Made(patching_rows(workspace, *_model(workspace, key)))
+    return StageOutput(patching_rows(workspace, *_model(workspace, key)))
 
 
 patching = stage(
@@ -229,14 +229,14 @@ patching = stage(
 )
 
 
-def _make_nulls(workspace: Workspace, _: None) -> Made:
+def _make_nulls(workspace: Workspace, _: None) -> StageOutput:
     """The effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
     from traps_pipeline.mechanism.nulls import null_rows
 
     return made_of("nulls", STEERING_NULLS, null_rows(workspace.tables.read(STEERING_EFFECTS, {})))
 
 
-def _make_steering_pecs(workspace: Workspace, _: None) -> Made:
+def _make_steering_pecs(workspace: Workspace, _: None) -> StageOutput:
     """PECS of the steered model under each sign policy, with the share of degenerate answers."""
     from traps_pipeline.mechanism.nulls import pecs_rows
 

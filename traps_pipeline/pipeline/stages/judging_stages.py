@@ -13,7 +13,7 @@ from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, 
 from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
 from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     return votes
 
 
-def _make_agreement(workspace: Workspace, _: None) -> Made:
+def _make_agreement(workspace: Workspace, _: None) -> StageOutput:
     """Agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
     Krippendorff."""
     from traps_pipeline.judging.agreement import agreement
@@ -71,14 +71,14 @@ def _make_agreement(workspace: Workspace, _: None) -> Made:
     return made_of("agreement", AGREEMENT, agreement(_votes(workspace, "agreement"), _panel(workspace)))
 
 
-def _make_judge_bias(workspace: Workspace, _: None) -> Made:
+def _make_judge_bias(workspace: Workspace, _: None) -> StageOutput:
     """Each judge's rate of yes against the panel's majority, per dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias
 
     return made_of("judge bias", JUDGE_BIAS, judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
 
 
-def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
+def _make_leave_one_out(workspace: Workspace, _: None) -> StageOutput:
     """PECS by the votes of two judges, for each judge that is left out."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.leave_one_out import leave_one_out
@@ -89,7 +89,7 @@ def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
     )
 
 
-def _make_confabulation(workspace: Workspace, _: None) -> Made:
+def _make_confabulation(workspace: Workspace, _: None) -> StageOutput:
     """Void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no such
     judge."""
     from traps_pipeline.judging.confabulation import collect_labels
@@ -97,13 +97,13 @@ def _make_confabulation(workspace: Workspace, _: None) -> Made:
     return collect_labels(workspace)
 
 
-def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
+def _many_invalid(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     labels = made.rows(CONFABULATION)
     invalid = sum(not label.valid for label in labels)
     return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
 
 
-def _make_prevalence(workspace: Workspace, _: None) -> Made:
+def _make_prevalence(workspace: Workspace, _: None) -> StageOutput:
     """How often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
     from traps_pipeline.scoring.prevalence import prevalence
 

@@ -24,7 +24,7 @@ from traps_pipeline.mechanism.probing_versions import (
     steering_version,
 )
 from traps_pipeline.models.registry import local_models
-from traps_pipeline.pipeline.graph import Check, Collect, Takes
+from traps_pipeline.pipeline.graph import Check, Collect, RunResources
 from traps_pipeline.pipeline.partitioning import EVERY
 from traps_pipeline.pipeline.schemes import (
     CATEGORY,
@@ -45,10 +45,10 @@ from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
 from traps_pipeline.pipeline.stages.tables_shown import made_of
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -88,17 +88,17 @@ def _probed_from(dataset: str) -> list[str]:
     return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
 
 
-def steers(wanted: Wanted, key: str | None) -> bool:
+def steers(wanted: StudyPartitions, key: str | None) -> bool:
     """Whether the study steers models."""
     return wanted.steers
 
 
-def _make_probe_items(workspace: Workspace, dataset: str) -> Made:
+def _make_probe_items(workspace: Workspace, dataset: str) -> StageOutput:
     """Clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with a
     question that they answer, and chaotic's clips with the frame times of the other side."""
     from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
-    return Made(rows_of(workspace, dataset))
+    return StageOutput(rows_of(workspace, dataset))
 
 
 probe_items = stage(
@@ -115,15 +115,15 @@ probe_items = stage(
 )
 
 
-def _make_hidden_states(workspace: Workspace, key: str) -> Made:
+def _make_hidden_states(workspace: Workspace, key: str) -> StageOutput:
     """Hidden states of a frozen local model at every layer, one row per item; only missing states are extracted."""
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
-    return Made(rows, Tally(asked=new), {"extracted": new})
+    return StageOutput(rows, Tally(asked=new), {"extracted": new})
 
 
-def _unsound_layers(workspace: Workspace, key: str | None, made: Made) -> list[int]:
+def _unsound_layers(workspace: Workspace, key: str | None, made: StageOutput) -> list[int]:
     from traps_pipeline.mechanism.stages import unsound_layers
 
     return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows(HIDDEN_STATES)[0].n_layers)
@@ -145,14 +145,14 @@ hidden_states = stage(
 )
 
 
-def _make_probes(workspace: Workspace, key: str) -> Made:
+def _make_probes(workspace: Workspace, key: str) -> StageOutput:
     """Probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
     from traps_pipeline.mechanism.stages import probe_rows
 
-    return Made(probe_rows(workspace, Extraction.parse(key)))
+    return StageOutput(probe_rows(workspace, Extraction.parse(key)))
 
 
-def _outside_shares(workspace: Workspace, key: str | None, made: Made) -> str:
+def _outside_shares(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     def is_wrong(row: ProbeRow) -> bool:
         figures = (row.value, row.low, row.high)
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
@@ -173,17 +173,17 @@ probes = stage(
     ],
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
-    takes=Takes(memory_gb=1.0, each_gb=0.5),
+    takes=RunResources(memory_gb=1.0, each_gb=0.5),
     wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 
 
-def _make_directions(workspace: Workspace, key: str) -> Made:
+def _make_directions(workspace: Workspace, key: str) -> StageOutput:
     """The void direction of every dataset at every layer, with draws of its nulls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
 
-    return Made(direction_rows(workspace, Extraction.parse(key)))
+    return StageOutput(direction_rows(workspace, Extraction.parse(key)))
 
 
 directions = stage(
@@ -200,7 +200,7 @@ directions = stage(
 )
 
 
-def _make_cosines(workspace: Workspace, _: None) -> Made:
+def _make_cosines(workspace: Workspace, _: None) -> StageOutput:
     """Cosines of every two void directions of a model at one layer, with their reliability."""
     from traps_pipeline.mechanism.cosines import cosine_rows
 
@@ -217,7 +217,7 @@ cosines = stage(
 )
 
 
-def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Answers of a model that is steered along every path into a dataset; answers in the ledger are not asked again."""
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
@@ -246,7 +246,7 @@ steering = stage(
 )
 
 
-def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """The votes of the study's panel on whether each steered answer abstains, and whether a control's is correct."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
@@ -272,14 +272,14 @@ def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)
 
 
-def _make_effects(workspace: Workspace, _: None) -> Made:
+def _make_effects(workspace: Workspace, _: None) -> StageOutput:
     """Abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
     return made_of("effects", STEERING_EFFECTS, effect_rows(*_judged(workspace)))
 
 
-def _make_shares(workspace: Workspace, _: None) -> Made:
+def _make_shares(workspace: Workspace, _: None) -> StageOutput:
     """Abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows
 

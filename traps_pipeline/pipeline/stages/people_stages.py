@@ -11,7 +11,7 @@ from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, 
 from traps_pipeline.pipeline.stages.judging_stages import confabulation
 from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -42,22 +42,22 @@ annotation_protocol = source(
 )
 
 
-def _make_labels(workspace: Workspace, _: None) -> Made:
+def _make_labels(workspace: Workspace, _: None) -> StageOutput:
     """People's labels of clips and answers that the study has, each with its item and what the panel decided; empty
     until somebody has labelled."""
     from traps_pipeline.people.labels import human_labels
 
-    return Made(human_labels(workspace))
+    return StageOutput(human_labels(workspace))
 
 
-def _make_agreement(workspace: Workspace, _: None) -> Made:
+def _make_agreement(workspace: Workspace, _: None) -> StageOutput:
     """How far people agree, by task and decision."""
     from traps_pipeline.people.labels import human_agreement
 
     return made_of("agreement of people", HUMAN_AGREEMENT, human_agreement(workspace.tables.read(HUMAN_LABELS, {})))
 
 
-def _make_row(workspace: Workspace, _: None) -> Made:
+def _make_row(workspace: Workspace, _: None) -> StageOutput:
     """Acc, AbsRec, FalseAbs and PECS of people with intervals, their agreement, and the seconds that a clip takes."""
     from traps_pipeline.people.human_scores import human_row
 
@@ -75,14 +75,14 @@ def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFr
     return labels, own.reset_index(drop=True)
 
 
-def _make_errors(workspace: Workspace, _: None) -> Made:
+def _make_errors(workspace: Workspace, _: None) -> StageOutput:
     """Sensitivity and specificity of the panel against people, by task; empty while it is not validated."""
     from traps_pipeline.people.corrected_scores import panel_errors
 
     return made_of("the panel against people", PANEL_ERRORS, panel_errors(*_labels_and_verdicts(workspace)))
 
 
-def _make_corrected(workspace: Workspace, _: None) -> Made:
+def _make_corrected(workspace: Workspace, _: None) -> StageOutput:
     """Every entry of the leaderboard as judged, and corrected for the panel's errors."""
     from traps_pipeline.people.corrected_scores import corrected
 

@@ -15,7 +15,7 @@ from traps_pipeline.pipeline.stages import (
 )
 from traps_pipeline.report.catalogue import FIGURES, TABLES
 from traps_pipeline.scoring.published import published_digest
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "report"
@@ -34,7 +34,7 @@ published = source(
 )
 
 
-def _report_page(workspace: Workspace, _: None) -> Made:
+def _report_page(workspace: Workspace, _: None) -> StageOutput:
     """Findings, leaderboard, figures and tables beside the paper's on one page that opens from disk; every number is a
     link into the explorer. A table or figure is made again only when a table that it reads changed."""
     from traps_pipeline.report.cards import Card, Sources
@@ -51,17 +51,17 @@ def _report_page(workspace: Workspace, _: None) -> Made:
         "made again": f"{len(remade)} of {len(pieces)}: {', '.join(remade[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
-    return Made(files, shown=shown)
+    return StageOutput(files, shown=shown)
 
 
-def _site(workspace: Workspace, _: None) -> Made:
+def _site(workspace: Workspace, _: None) -> StageOutput:
     """The explorer: all answers with their votes and clips, on pages that open from disk."""
     from traps_pipeline.report.explorer.site import site_files
 
     files = site_files(workspace)
     data = workspace.store.below(workspace.reports / "data", "*.js")
     workspace.store.remove({*data} - {workspace.reports / name for name in files})
-    return Made(files)
+    return StageOutput(files)
 
 
 def _parents(*names: str) -> list[Parent]:

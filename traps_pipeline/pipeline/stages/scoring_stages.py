@@ -13,7 +13,7 @@ from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
 from traps_pipeline.pipeline.stages.tables_shown import made_of, rows_shown
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.scoring.score_rows import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 GROUP = "scoring"
 
 
-def _make_metrics(workspace: Workspace, dataset: str) -> Made:
+def _make_metrics(workspace: Workspace, dataset: str) -> StageOutput:
     """Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.metrics import cell_metrics
@@ -30,10 +30,10 @@ def _make_metrics(workspace: Workspace, dataset: str) -> Made:
     judged = current(workspace, VERDICTS, dataset=dataset)
     if judged.empty:
         raise TrapsError(f"metrics {dataset}: no verdicts yet; materialize verdicts for a cell of this dataset first")
-    return Made(cell_metrics(judged))
+    return StageOutput(cell_metrics(judged))
 
 
-def _wrong_figures(workspace: Workspace, key: str | None, made: Made) -> str:
+def _wrong_figures(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     from traps_pipeline.scoring.metrics import wrong_figures
 
     wrong = wrong_figures(made.frame)
@@ -66,7 +66,7 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
     return cells, current(workspace, VERDICTS)
 
 
-def _make_contrasts(workspace: Workspace, _: None) -> Made:
+def _make_contrasts(workspace: Workspace, _: None) -> StageOutput:
     """Paired differences between models and between regimes, with intervals and Holm's correction."""
     from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
@@ -76,17 +76,17 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
     separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
     shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
-    return Made(table, shown=shown)
+    return StageOutput(table, shown=shown)
 
 
-def _make_regime_tests(workspace: Workspace, _: None) -> Made:
+def _make_regime_tests(workspace: Workspace, _: None) -> StageOutput:
     """McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
     return made_of("regime tests", REGIME_TESTS, mcnemar(_scored(workspace, "regime_tests")[1]))
 
 
-def _make_leaderboard(workspace: Workspace, _: None) -> Made:
+def _make_leaderboard(workspace: Workspace, _: None) -> StageOutput:
     """Every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals, ranks."""
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
@@ -96,17 +96,17 @@ def _make_leaderboard(workspace: Workspace, _: None) -> Made:
     board = rank(cells, intervals(resample(judged)), workspace.tables.read(CONTRASTS, {}))
     overall = board.loc[board["dataset"] == "overall", "pecs"].to_numpy(float)
     best = {"best overall PECS": float(overall.max())} if len(overall) else {}
-    return Made(board, shown={"leaderboard": Markdown(leaderboard_markdown(board))} | best)
+    return StageOutput(board, shown={"leaderboard": Markdown(leaderboard_markdown(board))} | best)
 
 
-def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
+def _wrong_intervals(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     from traps_pipeline.scoring.standings import wrong_intervals
 
     wrong = wrong_intervals(made.frame)
     return f"{wrong} intervals are wrong" if wrong else ""
 
 
-def _make_robust(workspace: Workspace, _: None) -> Made:
+def _make_robust(workspace: Workspace, _: None) -> StageOutput:
     """Conjunction, robust figure and inference of every model and regime with all four datasets and an arm; empty if no
     arm was run."""
     from traps_pipeline.judging.verdicts import current
@@ -118,14 +118,14 @@ def _make_robust(workspace: Workspace, _: None) -> Made:
     return made_of("conjunction", ROBUST, without_shortcuts(judged))
 
 
-def _wrong_robust(workspace: Workspace, key: str | None, made: Made) -> str:
+def _wrong_robust(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     from traps_pipeline.scoring.robust import wrong_rows
 
     wrong = wrong_rows(made.frame)
     return f"{wrong} rows are wrong" if wrong else ""
 
 
-def _make_hypotheses(workspace: Workspace, _: None) -> Made:
+def _make_hypotheses(workspace: Workspace, _: None) -> StageOutput:
     """Abstention and accuracy as one thing of the pairs is changed step by step, beside what rules get; empty if no
     variation was run."""
     from traps_pipeline.judging.verdicts import current
@@ -139,7 +139,7 @@ def _make_hypotheses(workspace: Workspace, _: None) -> Made:
     return made_of("doses", HYPOTHESES, by_dose(judged, offered))
 
 
-def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:
+def _wrong_doses(workspace: Workspace, key: str | None, made: StageOutput) -> str:
     from traps_pipeline.scoring.doses import wrong_rows
 
     wrong = wrong_rows(made.frame)

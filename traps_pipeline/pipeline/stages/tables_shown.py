@@ -5,19 +5,19 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.pipeline.previews import Markdown
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def made_of(name: str, table: Table, rows: "pd.DataFrame | Sequence[Any]") -> Made:
+def made_of(name: str, table: Table, rows: "pd.DataFrame | Sequence[Any]") -> StageOutput:
     """A table without partitions, from a frame or from values of its dataclass, with its first rows under a name."""
     import pandas as pd
 
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), columns=pd.Index(table.names))
-    return Made(frame, shown={name: rows_shown(frame)})
+    return StageOutput(frame, shown={name: rows_shown(frame)})
 
 
 def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> Markdown | str:
