@@ -35,7 +35,7 @@ KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 
 
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
-    """Requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
+    """Return requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
     from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.ledger.postgres import postgres_of
     from traps_pipeline.ledger.sqlite import SqliteDatabase
@@ -76,7 +76,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
 
 
 def bare(url: str, connections: int, answers: int) -> dict[str, float]:
-    """The least that a script would do: acompletion under a semaphore, answers kept in a list."""
+    """Return the least that a script would do: acompletion under a semaphore, answers kept in a list."""
     from traps_pipeline.models.api import load_litellm
 
     litellm = load_litellm()

@@ -41,7 +41,7 @@ class Version:
         self.scenarios: dict[str, int] = said["scenarios"]
 
     def work(self, scenario_id: str) -> dict[str, Any]:
-        """The seconds of each of WHAT for a record, and digests of the record and of what came of it."""
+        """Return the seconds of each of WHAT for a record, and digests of the record and of what came of it."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{scenario_id}\n")
         self._process.stdin.flush()
@@ -89,15 +89,15 @@ def work() -> None:
 
 
 def _cpu_seconds(call: Callable[[], Any]) -> tuple[float, Any]:
-    """User and system seconds of this process and its children, and what the call returns."""
+    """Return user and system seconds of this process and its children, and what the call returns."""
     began = os.times()
     result = call()
     return sum(os.times()[:4]) - sum(began[:4]), result
 
 
 def measure(versions: Sequence[Version], families: Sequence[str], records: int, repeats: int) -> tuple[Times, int]:
-    """The least seconds of each record, as means of each family, and how many records came out unlike in versions that
-    all have them."""
+    """Return the least seconds of each record, as means of each family, and how many records came out unlike in
+    versions that all have them."""
     for version in versions:
         version.work(f"{families[0]}-0001")  # first use opens contexts and compiles shaders
     times: Times = {}

@@ -61,7 +61,7 @@ OTHERS = {
 
 
 def experiment() -> str:
-    """The file that asks for the clips."""
+    """Return the file that asks for the clips."""
     names = [f"{family}-{n:04d}" for family in FAMILIES for n in range(1, SCENARIOS + 1)]
     return EXPERIMENT.format(scenarios=", ".join(names))
 
@@ -82,7 +82,9 @@ def rendered(study: Study, runs: int) -> tuple[float, list[Run]]:
 
 
 def without_cluster(count: int, cores: Sequence[int], plain: Mapping[str, str]) -> float:
-    """Seconds that so many processes of `traps run` take to render the clips of one study, each bound to a core."""
+    """Return seconds that so many processes of `traps run` take to render the clips of one study, each bound to a
+    core.
+    """
     with tempfile.TemporaryDirectory(prefix="scale-") as name:
         path = Path(name) / "rendering.yaml"
         path.write_text(experiment())
@@ -102,8 +104,8 @@ def without_cluster(count: int, cores: Sequence[int], plain: Mapping[str, str]) 
 
 
 def on_nodes(count: int, cores: Sequence[int], plain: Mapping[str, str], *, fixed: bool) -> tuple[float, float]:
-    """Seconds that so many nodes take to render the clips: from the first run's start to the last one's end, and as a
-    whole. fixed: each has CORES of CPU; else it is bound to a core."""
+    """Return seconds that so many nodes take to render the clips: from the first run's start to the last one's end, and
+    as a whole. fixed: each has CORES of CPU; else it is bound to a core."""
     with ExitStack() as opened:
         name = opened.enter_context(tempfile.TemporaryDirectory(prefix="scale-", ignore_cleanup_errors=True))
         database, store = opened.enter_context(Postgres.running()), opened.enter_context(S3.running())

@@ -89,7 +89,7 @@ class Cluster:
         print(f"{name} up after {time.monotonic() - began:.1f} s", flush=True)
 
     def processes(self, name: str) -> list[int]:
-        """The processes of a node, and those that they started."""
+        """Return the processes of a node, and those that they started."""
         mark, found = f"\0TRAPS_SCRATCH={self.folder / name}\0".encode(), list[int]()
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit() and int(entry.name) != os.getpid():
@@ -126,7 +126,7 @@ def _is_dead(pid: int) -> bool:
 
 
 def _of_run(run_id: str) -> list[int]:
-    """The processes that execute a run: Dagster's, not Ray's."""
+    """Return the processes that execute a run: Dagster's, not Ray's."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():

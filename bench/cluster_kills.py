@@ -90,7 +90,7 @@ class Scene:
     provider: Provider
 
     def busy(self) -> tuple[str, list[int]]:
-        """A node that executes a run, and the processes that do."""
+        """Return a node that executes a run, and the processes that do."""
         here = {pid for node in NODES for pid in self.cluster.processes(node)}
         found = {pid: told for pid, told in executing().items() if pid in here}
         node = next(node for _, node in found.values() if node)
@@ -206,7 +206,7 @@ def want_together(scene: Scene) -> None:
 
 
 def _launched(port: int, study: str) -> str:
-    """What Dagster's web server answers to what its page sends when answers of all cells are to be made."""
+    """Return what Dagster's web server answers to what its page sends when answers of all cells are to be made."""
     query = f"""mutation {{ launchPartitionBackfill(backfillParams: {{
         allPartitions: true, assetSelection: [{{path: ["{study}", "responses"]}}]
     }}) {{ __typename ... on LaunchBackfillSuccess {{ backfillId }} ... on PythonError {{ message }} }} }}"""
@@ -229,14 +229,14 @@ KILLS: dict[str, Callable[[Scene], None]] = {
 
 
 def spent_usd(study: Study) -> dict[str, float]:
-    """What the study has spent by its own count on each model: rows, and calls in flight."""
+    """Return what the study has spent by its own count on each model: rows, and calls in flight."""
     with study.opened() as workspace, workspace.ledger.writing():
         spent = Money(workspace.ledger).spent()
         return {model: spent.get(model, 0.0) for model in MODELS}
 
 
 def paying(usd: float, *, each: bool = False) -> list[str]:
-    """Options of `traps run`: a budget, and with `each` an equal part of it for each model."""
+    """Return options of `traps run`: a budget, and with `each` an equal part of it for each model."""
     parts = [f"{usd}", *(f"{model}={usd / len(MODELS)}" for model in MODELS if each)]
     return ["--no-preflight", *(word for part in parts for word in ("--budget-usd", part))]
 
@@ -253,7 +253,7 @@ def lose_clips(study: Study) -> int:
 
 
 def name_of(study: Study) -> str:
-    """The study's name."""
+    """Return the study's name."""
     with study.opened() as workspace:
         return workspace.study.name
 

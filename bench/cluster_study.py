@@ -78,7 +78,7 @@ class Study:
         )
 
     def python(self, code: str, *arguments: object) -> str:
-        """What code prints that works in the study."""
+        """Return what code prints that works in the study."""
         command = [sys.executable, "-c", code, *map(str, arguments)]
         done = subprocess.run(command, env=self.environment, cwd=self.root, text=True, capture_output=True, check=False)
         if done.returncode:
@@ -191,7 +191,7 @@ def watch(run: subprocess.Popen[str], kill: object, at: str = "scene_specs") -> 
 
 
 def asked(said: str) -> int:
-    """How many answers a command says that it asked; -1 where it says nothing of it."""
+    """Return how many answers a command says that it asked; -1 where it says nothing of it."""
     found = re.search(r"^(\d+) answers asked \(", said, re.MULTILINE)
     return int(found[1]) if found else -1
 
@@ -286,12 +286,12 @@ runs = [run for run in instance.get_runs() if any(key.path[0] == mine for key in
 
 
 def runs_of(study: Study) -> list[str]:
-    """What became of the study's runs."""
+    """Return what became of the study's runs."""
     return study.python(f"{RUNS}print(*(run.status.value for run in runs))").split()
 
 
 def failures_of(study: Study) -> str:
-    """What the study's failed runs said, a line for each error."""
+    """Return what the study's failed runs said, a line for each error."""
     return study.python(f"""{RUNS}
 for run in runs:
     if run.status.value == "FAILURE":
@@ -368,7 +368,7 @@ def tables_are_equal(study: Study, alone: Path, fetched: Path) -> None:
 
 
 def _states(path: Path) -> tuple[dict[str, bytes], dict[str, str]] | None:
-    """Tensors and what is said of them: a file has them in an order of its own."""
+    """Return tensors and what is said of them: a file has them in an order of its own."""
     from safetensors import safe_open
 
     if not path.is_file():

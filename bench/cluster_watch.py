@@ -67,13 +67,13 @@ class Proxy:
 
 
 def node_of(pid: int) -> str:
-    """The node that a process belongs to; empty where to none. Raises OSError where the process is gone."""
+    """Return the node that a process belongs to; empty where to none. Raises OSError where the process is gone."""
     parts = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     return next((part.partition(b"=")[2].decode() for part in parts if part.startswith(NODE + b"=")), "")
 
 
 def executing() -> dict[int, tuple[str, str]]:
-    """The processes that execute a run of Dagster: the run's id and the node."""
+    """Return the processes that execute a run of Dagster: the run's id and the node."""
     found = dict[int, tuple[str, str]]()
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():

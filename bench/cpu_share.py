@@ -17,7 +17,7 @@ FIRST = 100  # times the weight of others
 
 
 def is_there() -> bool:
-    """Whether this process may give shares."""
+    """Return whether this process may give shares."""
     return os.geteuid() == 0 and _version() != 0
 
 
@@ -44,7 +44,7 @@ def of_cores(name: str, cores: float) -> Iterator[list[str]]:
 
 
 def _version() -> int:
-    """Of the control groups that limit CPU and may be made here; 0 where none."""
+    """Return of the control groups that limit CPU and may be made here; 0 where none."""
     controllers, delegated = ROOT / "cgroup.controllers", ROOT / "cgroup.subtree_control"
     if controllers.is_file() and "cpu" in controllers.read_text().split() and os.access(delegated, os.W_OK):
         delegated.write_text("+cpu")

@@ -43,7 +43,7 @@ def _files(folder: Path, pattern: str) -> dict[str, Path]:
 
 
 def _table(old: Path, new: Path) -> str:
-    """What differs between two Parquet files; empty if nothing does."""
+    """Return what differs between two Parquet files; empty if nothing does."""
     a, b = pq.ParquetFile(old).read(), pq.ParquetFile(new).read()
     if a.schema.names != b.schema.names:
         return f"columns {sorted(set(a.schema.names) ^ set(b.schema.names)) or 'in another order'}"
@@ -63,7 +63,7 @@ def _footer(table: pa.Table) -> dict[str, Any]:
 
 
 def _file(old: Path, new: Path) -> str:
-    """Which line of two text files differs first, or that other files do; empty if nothing does."""
+    """Return which line of two text files differs first, or that other files do; empty if nothing does."""
     a, b = old.read_bytes(), new.read_bytes()
     if a == b:
         return ""

@@ -90,14 +90,14 @@ WHY_VALUE = ("The response names {a} as its answer.", "The final answer is state
 
 
 def slots(draw: random.Random, answer: str) -> dict[str, str]:
-    """Words for the templates."""
+    """Return words for the templates."""
     drawn = {slot: draw.choice(words) for slot, words in SLOTS.items()}
     others = {"d": draw.choice(SLOTS["c"]), "q": draw.choice(SLOTS["o"])}
     return {"t": f"{draw.random() * 5:.1f}", "u": f"{draw.random() * 5:.2f}", "a": answer, **drawn, **others}
 
 
 def made_study(folder: Path, models: int) -> Workspace:
-    """A study of all released scenarios with made-up answers and votes, scored by the project's own code."""
+    """Return a study of all released scenarios with made-up answers and votes, scored by the project's own code."""
     workspace = Workspace.create(folder, Study(name="explorer-bench", epoch="bench"))
     clip = folder / "clip.mp4"
     frames = [np.full((360, 480, 3), 3 * k, np.uint8) for k in range(75)]
@@ -131,7 +131,7 @@ def _evaluations(models: int) -> Iterator[Evaluation]:
 
 
 def _video(workspace: Workspace, clip: Path, frames: list[np.ndarray], spec: Any, side: str) -> VideoRow:
-    """A row of VIDEOS; its file is the one made-up clip under another name."""
+    """Return a row of VIDEOS; its file is the one made-up clip under another name."""
     import hashlib
 
     path, content = workspace.clip(spec.scenario_id, side, spec.scene_hash), clip.read_bytes()
@@ -148,7 +148,7 @@ def _video(workspace: Workspace, clip: Path, frames: list[np.ndarray], spec: Any
 
 
 def _cell(items: pd.DataFrame, cell: Cell, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """RESPONSES and VOTES rows of a cell. A model is the likelier to abstain the higher its number."""
+    """Return RESPONSES and VOTES rows of a cell. A model is the likelier to abstain the higher its number."""
     draw = random.Random(f"{seed} {cell.dataset}")
     skill = (int(cell.evaluation.model[-2:]) + 1) / 17
     now, answers, votes = pd.Timestamp("2026-01-01", tz="UTC"), [], []
@@ -240,7 +240,7 @@ PAIR = """hash => new Promise(done => {
 
 
 def memory_mb() -> float:
-    """The largest renderer among this process's descendants: proportional set size, in MB."""
+    """Return the largest renderer among this process's descendants: proportional set size, in MB."""
     sizes = [0.0]
     for status in Path("/proc").glob("[0-9]*/cmdline"):
         try:

@@ -45,7 +45,7 @@ VISION = {"hidden_size": 96, "intermediate_size": 256, "depth": 4, "num_heads": 
 
 
 def the_entry(name: str | None, folder: Path) -> ModelEntry:
-    """The entry of the model to measure."""
+    """Return the entry of the model to measure."""
     models = load_models()
     if name is None and "pocket" in models and (ASSETS / "pocket" / "weights" / "model.safetensors").exists():
         name = "pocket"
@@ -68,7 +68,7 @@ class Subject:
     spec: MediaSpec
 
     def prompt(self, number: int) -> Prompt:
-        """A prompt about one made-up clip, with the frames that the entry's media would take of it."""
+        """Return a prompt about one made-up clip, with the frames that the entry's media would take of it."""
         times = CLIP_S[pick(CLIP_S, self.spec)]
         width, height = self.spec.size or (WIDTH, HEIGHT)
         shape = (len(times), height, width, 3)
@@ -76,14 +76,14 @@ class Subject:
         return self.model.prompt(SYSTEM, f"Does it stop within {number} seconds, yes or no?", frames, times)
 
     def describe(self) -> str:
-        """What is measured."""
+        """Return what is measured."""
         count = sum(p.numel() for p in self.model.network.parameters())
         shown = f"{len(pick(CLIP_S, self.spec))} frames, prompt of {self.prompt(0).n_tokens} tokens"
         return f"{self.model.served_model}, {count / 1e6:.1f} M parameters, {shown}"
 
 
 def loaded(entry: ModelEntry, *, inside: bool) -> Subject:
-    """The entry's model, alone in memory."""
+    """Return the entry's model, alone in memory."""
     assert entry.media is not None, "local entries have media"
     adapter._LOADED.clear()
     gc.collect()
@@ -103,7 +103,7 @@ def told_peak(model: LocalModel, what: str, work: Callable[[], object]) -> None:
 
 
 def alternating(runs: int, **ways: Callable[[], object]) -> dict[str, tuple[float, float]]:
-    """Median wall and CPU seconds of each way, run in turn."""
+    """Return median wall and CPU seconds of each way, run in turn."""
     import torch
 
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
@@ -128,7 +128,7 @@ def endless(model: LocalModel) -> Iterator[None]:
 
 
 def line(what: str, ours: tuple[float, float], other: tuple[float, float], target: float | None = None) -> str:
-    """A ratio, with its medians and its target."""
+    """Return a ratio, with its medians and its target."""
     wall, cpu = ours[0] / other[0], ours[1] / other[1]
     said = f"{what:<44} {ours[0] * 1e3:8.2f} ms against {other[0] * 1e3:8.2f} ms: ratio {wall:.3f} (CPU time {cpu:.3f})"
     return said if target is None else f"{said}, target at most {target:.2f}"

@@ -40,8 +40,8 @@ class Remote(Checkout):
 
 
 def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
-    """A ledger as a study leaves it, in parts of an evaluation each, its key before them: the evaluation that will be
-    asked has rows of other keys too."""
+    """Yield a ledger as a study leaves it, in parts of an evaluation each, its key before them: the evaluation that
+    will be asked has rows of other keys too."""
     from traps_pipeline.models.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.pipeline.wanted import StudyPartitions
@@ -74,13 +74,13 @@ def fill(place: Path | str, rows: int) -> None:
 
 
 def _cpu_s(pid: int) -> float:
-    """CPU seconds of a process that runs."""
+    """Return CPU seconds of a process that runs."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def in_store(opened: ExitStack, folder: Path) -> Remote:
-    """A study in an object store of this machine, not made yet."""
+    """Return a study in an object store of this machine, not made yet."""
     from tests.conftest import make_checkout
     from tests.objectstore import S3, exported
     from tests.postgres import Postgres

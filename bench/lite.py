@@ -29,7 +29,7 @@ DRAWS = 400
 
 
 def chosen(most: int = 100) -> list[str]:
-    """The scenarios of the lite set, `most` of each taxonomy."""
+    """Return the scenarios of the lite set, `most` of each taxonomy."""
     by_family: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
     for name, spec in load_released().items():
         by_family[datasets_of_category(spec.category)[0], spec.family].append((spec.ground_truth, name))
@@ -46,7 +46,7 @@ def chosen(most: int = 100) -> list[str]:
 
 
 def _in_turn(rows: list[tuple[str, str]]) -> list[str]:
-    """The names with their answers in turn, those of an answer by digest."""
+    """Return the names with their answers in turn, those of an answer by digest."""
     by_answer: dict[str, list[str]] = defaultdict(list)
     for answer, name in sorted(rows, key=lambda row: digest(row[1])):
         by_answer[answer].append(name)
@@ -57,8 +57,8 @@ def _in_turn(rows: list[tuple[str, str]]) -> list[str]:
 
 
 def simulated(shares: np.ndarray, pairs: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Overall PECS and its standard error by the delta method, (models,) each, of answers drawn at these rates. shares:
-    (models, datasets, 3) of Acc, AbsRec, FalseAbs; pairs: (datasets,)."""
+    """Return overall PECS and its standard error by the delta method, (models,) each, of answers drawn at these rates.
+    shares: (models, datasets, 3) of Acc, AbsRec, FalseAbs; pairs: (datasets,)."""
     acc, rec, false = (rng.binomial(pairs, shares[..., k]) / pairs for k in range(3))
     j = np.maximum(rec - false, 0)
     variance = j**2 * acc * (1 - acc) + acc**2 * (rec * (1 - rec) + false * (1 - false)) + 2 * j * acc**2 * false
@@ -66,14 +66,14 @@ def simulated(shares: np.ndarray, pairs: np.ndarray, rng: np.random.Generator) -
 
 
 def separated(pecs: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """The sign of each pair's difference where it lies beyond 1.96 standard errors, else 0: (models, models)."""
+    """Return the sign of each pair's difference where it lies beyond 1.96 standard errors, else 0: (models, models)."""
     difference = pecs[:, None] - pecs[None, :]
     beyond = np.abs(difference) > 1.96 * np.hypot(error[:, None], error[None, :])
     return np.sign(difference) * beyond
 
 
 def fidelity(shares: np.ndarray, most: int, rng: np.random.Generator, draws: int) -> tuple[float, float, float]:
-    """Tau, share of separations kept, mean error of PECS, means over `draws`."""
+    """Return tau, share of separations kept, mean error of PECS, means over `draws`."""
     full = np.array([FULL[taxonomy_of(dataset)] * RUNS for dataset in DATASETS])
     small = np.full(len(DATASETS), most)
     truth = (shares[..., 0] * np.maximum(shares[..., 1] - shares[..., 2], 0)).mean(axis=1)

@@ -43,7 +43,7 @@ BY_CHANCE = ("random-50", "confidence-noise")
 
 
 def verdicts(model: str, regime: str, run: int, scenarios: Sequence[str]) -> Iterator[dict[str, object]]:
-    """What the panel decides of a reference model's answers to all pairs of these scenarios in one study."""
+    """Yield what the panel decides of a reference model's answers to all pairs of these scenarios in one study."""
     entry, released = get_model(model), load_released()
     for name in scenarios:
         spec = released[name]
@@ -67,20 +67,20 @@ def verdicts(model: str, regime: str, run: int, scenarios: Sequence[str]) -> Ite
 
 
 def observed(model: str, scenarios: Sequence[str]) -> float:
-    """The mean width of the interval of overall PECS over the studies."""
+    """Return the mean width of the interval of overall PECS over the studies."""
     rows = [row for regime in REGIMES for run in RUNS for row in verdicts(model, regime, run, scenarios)]
     found = intervals(resample(pd.DataFrame(rows), RESAMPLES)).set_index("dataset").loc["overall"]
     return float((found["pecs_ci_high"] - found["pecs_ci_low"]).mean())
 
 
 def pairs_of(scenarios: Sequence[str]) -> dict[str, int]:
-    """The number of pairs of each dataset."""
+    """Return the number of pairs of each dataset."""
     categories = [load_released()[name].category for name in scenarios]
     return {d: sum(d in datasets_of_category(category) for category in categories) for d in DATASETS}
 
 
 def compared(size: str, model: str, pairs: Mapping[str, int], seen: float) -> tuple[str, ...]:
-    """A row of the table."""
+    """Return a row of the table."""
     promised = precision(pairs, SHARES[model]).width
     return size, model, f"{promised:.4f}", f"{seen:.4f}", f"{promised / seen - 1:+.1%}" if seen else "-"
 
@@ -107,7 +107,7 @@ def main() -> None:
 
 
 def of_study(workspace: Workspace) -> list[tuple[str, ...]]:
-    """Rows of the reference models of a study, each with the mean over its regimes."""
+    """Return rows of the reference models of a study, each with the mean over its regimes."""
     board = workspace.tables.read(LEADERBOARD, {})
     counts = board.loc[board["dataset"] != "overall"].groupby("dataset")["n_pairs"].max()
     overall = board.loc[board["dataset"] == "overall"].set_index("model")

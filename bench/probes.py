@@ -30,8 +30,8 @@ WIDTH, SHARED = 4096, 400
 
 
 def layer_states(layer: int) -> dict[str, Split]:
-    """One layer of all items, float32: what the two sides of a scenario share has a spectrum that falls as 1/k, as that
-    of language models does; a weak void direction and noise come on top."""
+    """Return one layer of all items, float32: what the two sides of a scenario share has a spectrum that falls as 1/k,
+    as that of language models does; a weak void direction and noise come on top."""
     rng = np.random.default_rng(layer)
 
     def normal(*shape: int) -> np.ndarray:
@@ -49,12 +49,12 @@ def layer_states(layer: int) -> dict[str, Split]:
 
 
 def confabulated(splits: dict[str, Split]) -> dict[str, Split]:
-    """Four in five scenarios of each dataset, as a model that confabulates often has them."""
+    """Return four in five scenarios of each dataset, as a model that confabulates often has them."""
     return {name: split.rows(split.scenario % 5 != 0) for name, split in splits.items()}
 
 
 def run_layer(layer: int) -> int:
-    """All pairs of a layer, all samples and Cf->Cf; returns the number of evaluations."""
+    """Return all pairs of a layer, all samples and Cf->Cf; returns the number of evaluations."""
     done, splits = 0, layer_states(layer)
     for chosen in (splits, confabulated(splits)):
         for (_, target), scores in transfer_scores(chosen, TRANSFER_PAIRS).items():

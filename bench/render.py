@@ -46,13 +46,13 @@ def _model(spec: SceneSpec) -> mujoco.MjModel:
 
 
 def ours(spec: SceneSpec) -> int:
-    """Frames of the control as the videos stage draws them; how many."""
+    """Return frames of the control as the videos stage draws them; how many."""
     with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:
         return sum(1 for _ in renderer.frames(_qpos(spec)))
 
 
 def stock(spec: SceneSpec) -> int:
-    """The same frames through `mujoco.Renderer`, as MuJoCo's own tutorial draws them; how many."""
+    """Return the same frames through `mujoco.Renderer`, as MuJoCo's own tutorial draws them; how many."""
     model, camera, qpos = _model(spec), Camera.from_record(spec.camera), _qpos(spec)
     model.vis.quality.offsamples = 4
     data = mujoco.MjData(model)

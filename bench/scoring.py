@@ -71,7 +71,7 @@ def timed(what: str, work: Callable[[], Any]) -> Any:
 
 
 def study(models: int) -> tuple[Any, Any, Any]:
-    """Items, responses and votes of a made-up study, with the columns that `decide` reads."""
+    """Return items, responses and votes of a made-up study, with the columns that `decide` reads."""
     rng = np.random.default_rng(0)
     items = pd.DataFrame(
         [
@@ -100,7 +100,7 @@ def study(models: int) -> tuple[Any, Any, Any]:
 
 
 def ballot(asked: pd.DataFrame, judge: str, yes: np.ndarray, rng: np.random.Generator) -> pd.DataFrame:
-    """One judge's votes: right in 19 of 20, invalid in 1 of 100."""
+    """Return one judge's votes: right in 19 of 20, invalid in 1 of 100."""
     said = yes ^ (rng.random(len(asked)) < 0.05)
     on_abstention = (asked["task"] == "abstention").to_numpy(bool)
     abstained, correct = said.astype(object), said.astype(object)
@@ -112,7 +112,8 @@ def ballot(asked: pd.DataFrame, judge: str, yes: np.ndarray, rng: np.random.Gene
 
 
 def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, found: Any) -> float:
-    """CPU seconds for one entry's five percentile intervals, as one would write it; and that ours are hardly wider."""
+    """Return CPU seconds for one entry's five percentile intervals, as one would write it; and that ours are hardly
+    wider."""
     from scipy.stats import bootstrap
 
     began = time.process_time()

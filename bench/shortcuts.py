@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def first_of_each(specs: dict[str, SceneSpec], most: int | None) -> list[SceneSpec]:
-    """The records, at most so many of each family."""
+    """Return the records, at most so many of each family."""
     frame = pd.DataFrame({"id": list(specs), "family": [spec.family for spec in specs.values()]})
     ids = frame["id"] if most is None else frame.groupby("family")["id"].head(most)
     return [specs[scenario_id] for scenario_id in ids]
@@ -134,12 +134,12 @@ def measure(spec: SceneSpec, folder: Path, whole: bool = False) -> Measured:
 
 
 def given(certificate: Certificate, spec: SceneSpec) -> bool:
-    """Whether the record's own evidence carries a certificate; `traps benchmark certify` measures it again."""
+    """Return whether the record's own evidence carries a certificate; `traps benchmark certify` measures it again."""
     return certificate.failure(stored_evidence(spec), Claim.of_record(spec)) is None
 
 
 def read_whole(world: World, spec: SceneSpec, qpos: np.ndarray) -> str | None:
-    """What the observer answers from the control's clip, as a model is shown it."""
+    """Return what the observer answers from the control's clip, as a model is shown it."""
     with world.closed_renderer() as renderer, TemporaryDirectory() as folder:
         clip = Path(folder) / "control.mp4"
         encode(list(closing_frames(renderer, qpos, world.board)), clip, world.physics.fps)
@@ -147,7 +147,7 @@ def read_whole(world: World, spec: SceneSpec, qpos: np.ndarray) -> str | None:
 
 
 def turned_deg(model: mujoco.MjModel, qpos: np.ndarray) -> float:
-    """How far the hinge that turns most turns between its extremes."""
+    """Return how far the hinge that turns most turns between its extremes."""
     hinges = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
     return math.degrees(float(np.ptp(qpos[:, hinges], axis=0).max()))
 

@@ -63,8 +63,8 @@ def main() -> None:
 
 
 def random_entry(folder: Path) -> ModelEntry:
-    """The entry of a random checkpoint of middle size, in float32 on the CPU. With the pocket model's tokenizer, since
-    bytes as tokens would make a prompt mostly text."""
+    """Return the entry of a random checkpoint of middle size, in float32 on the CPU. With the pocket model's tokenizer,
+    since bytes as tokens would make a prompt mostly text."""
     from tokenizers import Tokenizer
 
     words = Tokenizer.from_file(str(ASSETS / "pocket" / "weights" / "tokenizer.json"))

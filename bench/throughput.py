@@ -29,7 +29,7 @@ PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
 
 
 def _clips(folder: Path) -> Iterator[Path]:
-    """Real clips: the control of a released scenario, each shifted by another number of pixels."""
+    """Yield real clips: the control of a released scenario, each shifted by another number of pixels."""
     from bench.render import _model, _qpos
     from traps_pipeline.benchmark.records import load_released
     from traps_pipeline.scenes.picture.camera import Camera

@@ -64,8 +64,8 @@ with dg.DagsterInstance.get() as history:
 
 
 def study(folder: Path, cells: int, shared: dict[str, str] | None) -> dict[str, str]:
-    """A workspace whose study names so many cells, of models in a registry of its own; its environment. shared: the
-    variables of a study in an object store."""
+    """Return a workspace whose study names so many cells, of models in a registry of its own; its environment. shared:
+    the variables of a study in an object store."""
     models = -(-cells // (DATASETS * REGIMES * RUNS))
     entries = [  # each of its own: a dictionary that is written twice would become an alias, which the reader refuses
         {"id": f"m{n:04d}", "backend": "reference", "params": {"strategy": "oracle"}, "runs": RUNS}
@@ -100,7 +100,9 @@ def study(folder: Path, cells: int, shared: dict[str, str] | None) -> dict[str, 
 
 
 def stock(folder: Path, cells: int, shared: dict[str, str] | None) -> dict[str, str]:
-    """A folder with the stock project; its environment. shared: with the address of a database for its history."""
+    """Return a folder with the stock project; its environment. shared: with the address of a database for its
+    history.
+    """
     home = folder / "home"
     home.mkdir()
     if shared:
@@ -136,7 +138,7 @@ def serving(command: list[str], environment: dict[str, str], folder: Path) -> It
 
 
 def seconds(page: Page, address: str, text: str) -> float:
-    """Seconds from opening a page until it shows a text; the least of several views."""
+    """Return seconds from opening a page until it shows a text; the least of several views."""
     found = []
     for _ in range(VIEWS):
         begun = time.monotonic()
@@ -147,7 +149,7 @@ def seconds(page: Page, address: str, text: str) -> float:
 
 
 def measure(kind: str, cells: int, browser: Any, *, in_database: bool) -> dict[str, float]:
-    """Seconds of each page for one project."""
+    """Return seconds of each page for one project."""
     from tests.objectstore import S3
     from tests.postgres import Postgres
 

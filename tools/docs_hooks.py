@@ -40,7 +40,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Point links at where the files lie on the site. Links in code are left alone."""
+    """Return point links at where the files lie on the site. Links in code are left alone."""
     source = _source(page.file.src_uri)
     if source is None:
         return markdown
@@ -60,7 +60,7 @@ def _targets(page: Path) -> Iterator[Path]:
 
 
 def _place(path: Path) -> str:
-    """Where a file of the repository lies on the site."""
+    """Return where a file of the repository lies on the site."""
     if path == ROOT / "README.md":
         return "index.md"
     if path.is_relative_to(ROOT / "docs"):
@@ -69,7 +69,7 @@ def _place(path: Path) -> str:
 
 
 def _source(place: str) -> Path | None:
-    """The file of the repository behind a page of the site; None for a page of the reference."""
+    """Return the file of the repository behind a page of the site; None for a page of the reference."""
     if place == "index.md":
         return ROOT / "README.md"
     if place.startswith("reference/"):
@@ -81,7 +81,7 @@ def _source(place: str) -> Path | None:
 
 
 def reference() -> dict[str, str]:
-    """The text of each page by its name: one a room of the package, and `index`."""
+    """Return the text of each page by its name: one a room of the package, and `index`."""
     rooms = {}
     for path in sorted(PACKAGE.iterdir()):
         modules = sorted(path.rglob("*.py")) if path.is_dir() else [path] if path.suffix == ".py" else []
@@ -99,7 +99,7 @@ def _first_line(room: str) -> str:
 
 
 def _module(path: Path) -> str:
-    """The section of a module: its docstring, and its public classes and functions."""
+    """Return the section of a module: its docstring, and its public classes and functions."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     members = "\n".join(_members(tree, ""))
@@ -131,12 +131,12 @@ def _signature(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> s
 
 
 def _prose(text: str | None) -> str:
-    """A docstring as Markdown: paragraphs as they are, indented parts as code."""
+    """Return a docstring as Markdown: paragraphs as they are, indented parts as code."""
     paragraphs = (text or "").split("\n\n")
     return "\n\n".join(one if one.startswith("    ") else _escaped(one) for one in paragraphs)
 
 
 def _escaped(text: str) -> str:
-    """Prose that Markdown takes for nothing else; code in backticks stays code."""
+    """Return prose that Markdown takes for nothing else; code in backticks stays code."""
     parts = re.split(r"(`[^`]*`)", text)
     return "".join(part if part.startswith("`") else re.sub(r"([*_<>\[\]#|])", r"\\\1", part) for part in parts)

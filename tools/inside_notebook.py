@@ -59,14 +59,14 @@ def execute(made: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main() -> None:
     """Run the page and write the notebook beside it."""
-    made = cells((DOCS / "inside.md").read_text(encoding="utf-8"))
-    execute(made)
+    notebook_cells = cells((DOCS / "inside.md").read_text(encoding="utf-8"))
+    execute(notebook_cells)
     about = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
     }
-    whole = {"cells": made, "metadata": about, "nbformat": 4, "nbformat_minor": 5}
-    text = json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
+    notebook = {"cells": notebook_cells, "metadata": about, "nbformat": 4, "nbformat_minor": 5}
+    text = json.dumps(notebook, ensure_ascii=False, indent=1) + "\n"
     (DOCS / "inside.ipynb").write_text(text, encoding="utf-8", newline="\n")
 
 

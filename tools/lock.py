@@ -45,7 +45,7 @@ def compile_lock(out: Path, needs: str, *options: str | Path) -> None:
 
 
 def without_addresses(pylock: str) -> str:
-    """A `pylock.toml` whose files lie in the folder `wheels`. Raises ValueError where an address is left."""
+    """Return a `pylock.toml` whose files lie in the folder `wheels`. Raises ValueError where an address is left."""
     pylock = re.sub(r'\burl = "[^"]*/([^"/]+)"', rf'path = "{WHEELS}/\1"', pylock)
     pylock = re.sub(r"upload-time = [^,]+, ", "", pylock)  # of the index, not of the file
     pylock = re.sub(r'^index = ".*"\n', "", pylock, flags=re.MULTILINE)
@@ -64,8 +64,8 @@ def outdated(project: Path = ROOT / "pyproject.toml", lock: Path = LOCK) -> Iter
     table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
     extras = table["optional-dependencies"]
     pins = dict(re.findall(r"^([\w.-]+)(?:\[.*?\])?==([^ ;]+)", lock.read_text(encoding="utf-8"), re.MULTILINE))
-    wanted = [*table["dependencies"], *(line for name in extras if name not in UNLOCKED for line in extras[name])]
-    for requirement in map(Requirement, wanted):
+    requirements = [*table["dependencies"], *(line for name in extras if name not in UNLOCKED for line in extras[name])]
+    for requirement in map(Requirement, requirements):
         name = re.sub(r"[-_.]+", "-", requirement.name).lower()
         if name in (table["name"], "torch"):
             continue

@@ -35,7 +35,7 @@ NEARLY_WHITE = 245
 
 
 def moving_pair(workspace: Workspace) -> bytes:
-    """An animated GIF of a pair: control and void side by side, and at the end what may be answered."""
+    """Return an animated GIF of a pair: control and void side by side, and at the end what may be answered."""
     items = workspace.tables.read_all(ITEMS).query("scenario_id == @SCENARIO and dataset == 'occlusion'")
     control, void = (items.loc[items["side"] == side].iloc[0] for side in ("control", "void"))
     (left, times), (right, _) = (decode(workspace.resolve(row["clip"])) for row in (control, void))
@@ -74,14 +74,14 @@ def _beside(frames: Sequence[Image.Image]) -> Image.Image:
 
 
 def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """The font of all figures, which matplotlib brings along."""
+    """Return the font of all figures, which matplotlib brings along."""
     from matplotlib import get_data_path
 
     return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans{'-Bold' if bold else ''}.ttf", size)
 
 
 def finding() -> bytes:
-    """A PNG: how often each of the paper's models abstains on voids, asked plainly and told not to guess."""
+    """Return a PNG: how often each of the paper's models abstains on voids, asked plainly and told not to guess."""
     shares = published_overall().pivot(index="model", columns="regime", values="abs_rec").mul(100)
     shares = shares.loc[:, ["standard", "guided"]].dropna().sort_values("standard")
     with figure_style():

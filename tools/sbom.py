@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def licences(found: PackageMetadata) -> list[dict[str, Any]]:
-    """What a package says of its licence: an SPDX expression, else its classifiers' names, else nothing."""
+    """Return what a package says of its licence: an SPDX expression, else its classifiers' names, else nothing."""
     if "License-Expression" in found:
         return [{"expression": found["License-Expression"]}]
     named = [line.split(" :: ")[-1] for line in found.get_all("Classifier", []) if line.startswith("License :: ")]
@@ -27,7 +27,7 @@ def licences(found: PackageMetadata) -> list[dict[str, Any]]:
 
 
 def component(package: dict[str, Any]) -> dict[str, Any]:
-    """One package of the lock."""
+    """Return one package of the lock."""
     name, version = package["name"], package["version"]
     files = [*package.get("wheels", ()), *filter(None, [package.get("sdist")])]
     distributions = [
@@ -39,18 +39,19 @@ def component(package: dict[str, Any]) -> dict[str, Any]:
         for file in files
     ]
     purl = f"pkg:pypi/{name}@{version}"
-    made = {"type": "library", "bom-ref": purl, "name": name, "version": version, "purl": purl}
+    entry = {"type": "library", "bom-ref": purl, "name": name, "version": version, "purl": purl}
     try:
-        found = metadata(name)
+        distribution = metadata(name)
     except PackageNotFoundError:
-        found = None
-    if found is not None and found["Version"] == version and (said := licences(found)):
-        made["licenses"] = said
-    return made | {"externalReferences": sorted(distributions, key=lambda one: one["url"])}
+        distribution = None
+    if distribution is not None and distribution["Version"] == version and (licence := licences(distribution)):
+        entry["licenses"] = licence
+    return entry | {"externalReferences": sorted(distributions, key=lambda one: one["url"])}
 
 
 def bill(pylock: str, project: dict[str, Any]) -> dict[str, Any]:
-    """The whole bill of the text of a `pylock.toml`, without a time and a serial number: it is named by its content."""
+    """Return the whole bill of the text of a `pylock.toml`, without a time and a serial number: it is named by its
+    content."""
     packages = sorted(tomllib.loads(pylock)["packages"], key=lambda one: (one["name"], one["version"]))
     purl = f"pkg:pypi/{project['name']}@{project['version']}"
     ours = {"type": "application", "bom-ref": purl, "name": project["name"], "version": project["version"]}
@@ -67,10 +68,10 @@ def main() -> None:
     """Write the bill to the file that the first argument names."""
     (out,) = map(Path, sys.argv[1:])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    made = bill((ROOT / "pylock.toml").read_text(encoding="utf-8"), project)
+    document = bill((ROOT / "pylock.toml").read_text(encoding="utf-8"), project)
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    print(f"{out}: {len(made['components'])} packages")
+    out.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    print(f"{out}: {len(document['components'])} packages")
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ class Loaded:
         return self.items["void"].to_numpy(bool)
 
     def where(self, chosen: Any) -> Loaded:
-        """The items that a mask (n,) or a query on `items` chooses."""
+        """Return the items that a mask (n,) or a query on `items` chooses."""
         mask = self.items.eval(chosen) if isinstance(chosen, str) else chosen
         mask = np.asarray(mask, bool)
         return Loaded(self.X[mask], self.items.loc[mask].reset_index(drop=True))
@@ -81,19 +81,19 @@ def load(
     prompt: str = "standard",
     datasets: Sequence[str] | None = None,
 ) -> Loaded:
-    """The states of a study's items at one layer (0: embeddings; `normed`: the last one after the final norm), joined
-    with the verdicts of run 1. datasets: some of those that have states; all by default.
+    """Return the states of a study's items at one layer (0: embeddings; `normed`: the last one after the final norm),
+    joined with the verdicts of run 1. datasets: some of those that have states; all by default.
 
     Raises TrapsError when the study has no such states, model, layer or dataset.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
-    there = [*dict.fromkeys(states.items["dataset"])]
-    unknown = sorted(set(datasets or ()) - set(there))
+    available = [*dict.fromkeys(states.items["dataset"])]
+    unknown = sorted(set(datasets or ()) - set(available))
     if unknown:
-        raise TrapsError(f"no hidden states of {unknown[0]}; the study has {', '.join(there)}")
+        raise TrapsError(f"no hidden states of {unknown[0]}; the study has {', '.join(available)}")
     parts, vectors = list[pd.DataFrame](), list[np.ndarray]()
-    for dataset in datasets or there:
+    for dataset in datasets or available:
         items = pd.DataFrame(
             states.dataset(dataset)[["item_id", "dataset", "scenario_id", "side", "sub_scenario"]]
         ).reset_index(drop=True)
@@ -131,8 +131,8 @@ def protocol(
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
     features: Loaded | None = None,
 ) -> pd.DataFrame:
-    """The study's own protocol for another probe: the rows that the table `probe_baselines` has for its baselines, with
-    the same items, folds, splits by scenario and intervals.
+    """Return the study's own protocol for another probe: the rows that the table `probe_baselines` has for its
+    baselines, with the same items, folds, splits by scenario and intervals.
 
     fit: states (n, d) and void (n,) to anything with `scores` (`from_sklearn`, `mean_difference`, your own). change: a
     change of the states of a dataset, (n, d) to (n, k). features: what items have in the place of the study's states;
@@ -175,7 +175,8 @@ def gate(
     prompt: str = "standard",
     without: Collection[str] = (),
 ) -> Gate:
-    """A gate that decides now: `abstains(model, prompt)` and `answer(model, prompt)` for a model and prompt of ours.
+    """Return a gate that decides now: `abstains(model, prompt)` and `answer(model, prompt)` for a model and prompt of
+    ours.
 
     source: `one:DATASET`, `other datasets` (than the target) or `other families`. threshold: mid, J or conformal.
     layer: that of the gate stage by default. without: scenarios, or families as the gate stage names them
@@ -252,12 +253,12 @@ class Direction:
             handle.remove()
 
     def __neg__(self) -> Direction:
-        """The reverse direction."""
+        """Return the reverse direction."""
         return replace(self, vector=-self.vector)
 
 
 def _block(model: Any, layer: int) -> tuple[Module, int]:
-    """A block, and the width of the model's states."""
+    """Return a block, and the width of the model's states."""
     network = getattr(model, "network", model)
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks = getattr(decoder, "layers", None)
@@ -278,15 +279,16 @@ def direction(
     kind: str = "void",
     draw: int = 0,
 ) -> Direction:
-    """A saved direction of a study: the void direction of a dataset, or a draw of one of its nulls, with the class gap.
+    """Return a saved direction of a study: the void direction of a dataset, or a draw of one of its nulls, with the
+    class gap.
 
     Raises TrapsError when the study has no such direction.
     """
-    found: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
-    if dataset not in found or kind not in found[dataset].vectors:
-        there = ", ".join(f"{name} ({', '.join(of.vectors)})" for name, of in found.items())
-        raise TrapsError(f"no {kind} direction of {dataset}; the study has {there or 'none'}")
-    of = found[dataset]
+    directions: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
+    if dataset not in directions or kind not in directions[dataset].vectors:
+        available = ", ".join(f"{name} ({', '.join(of.vectors)})" for name, of in directions.items())
+        raise TrapsError(f"no {kind} direction of {dataset}; the study has {available or 'none'}")
+    of = directions[dataset]
     if not 0 <= layer < of.n_layers or not 0 <= draw < len(of.vectors[kind]):
         raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {of.n_layers - 1}")
     return Direction(of.vectors[kind][draw][layer], layer, float(of.gaps[layer]))

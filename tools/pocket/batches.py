@@ -51,13 +51,13 @@ class Scenes:
             self.records += records
 
     def frames(self, scene: int, side: int, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Frames of a clip, uint8 (N, H, W, 3); pairs: of these pairs of frames alone."""
+        """Return frames of a clip, uint8 (N, H, W, 3); pairs: of these pairs of frames alone."""
         shard, place = self._place[scene]
         frames = self._frames[shard][place, side]
         return frames if pairs is None else frames[[2 * pair + i for pair in pairs for i in (0, 1)]]
 
     def names(self, scene: int, side: int, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """The words that name every token of a clip, or of these pairs of its frames, as in `names_of`."""
+        """Return the words that name every token of a clip, or of these pairs of its frames, as in `names_of`."""
         known = (scene, side)
         if known not in self._names:
             closed = self._open_frames(scene, side)
@@ -69,14 +69,15 @@ class Scenes:
         return every.reshape(-1, tokens, every.shape[1])[[*pairs]].reshape(-1, every.shape[1])
 
     def times(self, scene: int, side: int) -> list[float]:
-        """Seconds into the clip of each frame."""
+        """Return seconds into the clip of each frame."""
         record = self.records[scene]
         every = np.arange(record.length(side)) / get_family(record.family).physics.fps
         return every[pick(every, self._spec)].tolist()
 
     def _open_frames(self, scene: int, side: int) -> int:
-        """How many of the frames shown come before a panel closes the clip; nothing closes a decoy. Those of a void
-        that a panel hides from its beginning are at the same times as its control's, which else would tell the side."""
+        """Return how many of the frames shown come before a panel closes the clip; nothing closes a decoy. Those of a
+        void that a panel hides from its beginning are at the same times as its control's, which else would tell the
+        side."""
         record, times = self.records[scene], self.times(scene, side)
         closes = None if side == 2 else record.closes_frame
         if closes is None:
@@ -96,7 +97,8 @@ class Scenes:
         return tuple(sorted([last, *(int(pair) for pair in rng.permutation(others)[: count - 1])]))
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
-        """A random clip with its question, another one (answerable or ill-posed), and two for the place of its ball."""
+        """Return a random clip with its question, another one (answerable or ill-posed), and two for the place of its
+        ball."""
         scene, side = int(rng.integers(len(self.records))), int(rng.random() < void_share)
         record = self.records[scene]
         if side:
@@ -109,7 +111,7 @@ class Scenes:
 
 
 def _where(record: SceneRecord, frame: str) -> tuple[Question, Question]:
-    """The questions for the column and the row of the ball at the end of a clip."""
+    """Return the questions for the column and the row of the ball at the end of a clip."""
     place = record.places[frame]
     return Question(*place_question(record.ball, place, 0)), Question(*place_question(record.ball, place, 1))
 
@@ -152,7 +154,7 @@ class Batches:
         return self.make(looks, prompt_name, augmented(frames, self._training.brightness, rng))
 
     def make(self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray) -> Batch:
-        """The batch of some clips, as many pairs of each, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
+        """Return the batch of some clips, as many pairs of each, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
         import torch
 
         grid = (frames.shape[1] // 2, frames.shape[2] // PATCH, frames.shape[3] // PATCH)
@@ -174,9 +176,9 @@ class Batches:
     def _pieces(
         self, look: Look, prompt_name: str, grid: tuple[int, int, int]
     ) -> tuple[str, list[str], list[tuple[str, str]]]:
-        """The chat as the processor writes it, cut into pieces: the system's part; the whole clip, in which all but the
-        first and the last piece are a pair of frames each, as a time stamp and placeholders for tokens; and for each
-        question its text with the beginning of the answer, and the answer."""
+        """Return the chat as the processor writes it, cut into pieces: the system's part; the whole clip, in which all
+        but the first and the last piece are a pair of frames each, as a time stamp and placeholders for tokens; and for
+        each question its text with the beginning of the answer, and the answer."""
         processor, token = self._processor, self._processor.video_token
         times = self._scenes.times(look.scene, look.side)
         pairs = [
@@ -238,25 +240,25 @@ class Batches:
     def _placed(
         self, head: list[int], clip: list[list[int]], shown: tuple[int, ...] | None, grid: tuple[int, int]
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """The ids (A,) of a clip's pieces without the pairs of frames that are not shown; the positions (3, P + A) that
-        the system's part and they have in the whole clip; and the first position behind the whole clip."""
+        """Return the ids (A,) of a clip's pieces without the pairs of frames that are not shown; the positions (3, P +
+        A) that the system's part and they have in the whole clip; and the first position behind the whole clip."""
         import torch
 
-        whole = torch.tensor([head + [token for piece in clip for token in piece]])
-        kinds = (whole == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
+        tokens = torch.tensor([head + [token for piece in clip for token in piece]])
+        kinds = (tokens == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
         every = range(len(clip) - 2)
-        placed, _ = self._rope_index(whole, kinds, video_grid_thw=torch.tensor([[len(every), *grid]]))
+        placed, _ = self._rope_index(tokens, kinds, video_grid_thw=torch.tensor([[len(every), *grid]]))
         # The pair of frames of each piece; the first two are the system's part and the clip's opening.
         pieces = [None, None, *every, None]
         lengths = [len(head), *map(len, clip)]
         kept = [pair is None or shown is None or pair in shown for pair in pieces]
         mask = torch.tensor(kept).repeat_interleave(torch.tensor(lengths))
-        return whole[0, mask][len(head) :], placed[:, 0, mask], int(placed.max()) + 1
+        return tokens[0, mask][len(head) :], placed[:, 0, mask], int(placed.max()) + 1
 
 
 def patches(frames: torch.Tensor) -> torch.Tensor:
-    """Frames (B, N, 3, H, W) in the input format of the class: one row per patch of two frames; patches that the model
-    merges are adjacent."""
+    """Return frames (B, N, 3, H, W) in the input format of the class: one row per patch of two frames; patches that the
+    model merges are adjacent."""
     batch, count, channels, height, width = frames.shape
     rows, columns = height // PATCH, width // PATCH
     split = frames.view(batch, count // 2, 2, channels, rows // 2, 2, PATCH, columns // 2, 2, PATCH)
@@ -296,8 +298,8 @@ def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
 
 
 def name_tokens(tokenizer: Any) -> torch.Tensor:
-    """Token ids of the words of `names_of`: colours as they stand in questions, columns and rows as in answers. A word
-    that is no single token, which happens only with few scenes, has the id of its first piece."""
+    """Return token ids of the words of `names_of`: colours as they stand in questions, columns and rows as in answers.
+    A word that is no single token, which happens only with few scenes, has the id of its first piece."""
     import torch
 
     words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS]
@@ -305,6 +307,7 @@ def name_tokens(tokenizer: Any) -> torch.Tensor:
 
 
 def augmented(frames: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
-    """Frames (B, N, H, W, 3) uint8, with each whole clip made brighter or darker by up to the share `brightness`."""
+    """Return frames (B, N, H, W, 3) uint8, with each whole clip made brighter or darker by up to the share
+    `brightness`."""
     gains = (1 + brightness * rng.uniform(-1, 1, (len(frames), 1, 1, 1, 1))).astype(np.float32)
     return np.minimum(frames * gains, 255).astype(np.uint8)

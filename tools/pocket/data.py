@@ -52,7 +52,7 @@ class Question:
     draw: float | None = None
 
     def label(self, share: float) -> str | None:
-        """The answer under a prompt with that share of abstentions."""
+        """Return the answer under a prompt with that share of abstentions."""
         return None if self.draw is not None and self.draw < share else self.answer
 
 
@@ -92,7 +92,7 @@ class SceneRecord:
     decoy: bool = False
 
     def length(self, side: int) -> int:
-        """Frames of the clip of a side (0 control, 1 void, 2 decoy)."""
+        """Return frames of the clip of a side (0 control, 1 void, 2 decoy)."""
         if side == 1 and self.cut_frame is not None:
             return self.void_length or self.cut_frame
         return (self.control_until or self.n_frames) - self.control_from
@@ -110,7 +110,7 @@ class SceneRecord:
 
     @staticmethod
     def read(line: str) -> SceneRecord:
-        """A record from its line of JSON."""
+        """Return a record from its line of JSON."""
         values = json.loads(line)
         for name in ("asked", "visual", "ill_posed", "answerable"):
             values[name] = Question(**values[name])
@@ -146,18 +146,18 @@ class ShardJob:
         return self.lines.with_suffix(".npy")
 
     def clip(self, place: int, side: str) -> Path:
-        """The clip of a held-out scene."""
+        """Return the clip of a held-out scene."""
         return self.lines.parent / "clips" / f"{self.number:03d}-{place:02d}_{side}.mp4"
 
 
 def params_digest(family: str, params: Any) -> str:
-    """Digest of a scene's family and parameters, which is equal for equal scenes."""
+    """Return digest of a scene's family and parameters, which is equal for equal scenes."""
     return digest({"family": family, "params": json.loads(json.dumps(params))})
 
 
 @cache
 def released_digests() -> frozenset[str]:
-    """`params_digest` of every released scene and of its twin."""
+    """Return `params_digest` of every released scene and of its twin."""
     from traps_pipeline.benchmark.records import load_released
 
     specs = load_released().values()
@@ -169,8 +169,8 @@ def released_digests() -> frozenset[str]:
 
 
 def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -> SceneRecord:
-    """The scene's questions with their labels: a void's label is an abstention with probability `abstain_share`, else a
-    guess; with shares by prompt, the number that decides this is kept."""
+    """Return the scene's questions with their labels: a void's label is an abstention with probability `abstain_share`,
+    else a guess; with shares by prompt, the number that decides this is kept."""
 
     def void(question: str, labels: Sequence[str]) -> Question:
         draw, guessed = rng.random(), guess(question, labels, rng)
@@ -252,7 +252,7 @@ def _write_clips(job: ShardJob, record: SceneRecord, place: int, sides: Sequence
 
 
 def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:
-    """All shards of a split, in an order that alternates between families."""
+    """Return all shards of a split, in an order that alternates between families."""
     banned = released_digests()
     jobs = []
     for family in recipe.scenes:
@@ -282,19 +282,19 @@ def render(
 
 
 def _check_recipe(recipe: Recipe, folder: Path) -> None:
-    """Raises TrapsError when the folder holds scenes of another recipe."""
+    """Raise TrapsError when the folder holds scenes of another recipe."""
     # The numbers of scenes may change: a shard's first scenes do not depend on how many there are.
     decisive = ("data_seed", "media", "abstain_share", "abstain_shares", "jitter", "decoys")
-    made = digest(recipe.content(*decisive))
+    expected = digest(recipe.content(*decisive))
     note = folder / "recipe.sha256"
     if not note.is_file():
-        write_text(note, made + "\n")
-    elif note.read_text(encoding="utf-8").strip() != made:
+        write_text(note, expected + "\n")
+    elif note.read_text(encoding="utf-8").strip() != expected:
         raise TrapsError(f"{folder}: holds scenes of another recipe; give another folder, or delete it")
 
 
 def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[ShardJob, list[SceneRecord]]]:
-    """Every shard of a split with its records. Raises TrapsError when scenes are missing."""
+    """Yield every shard of a split with its records. Raises TrapsError when scenes are missing."""
     for job in shard_jobs(recipe, split, folder):
         if job.drawn < job.count:
             raise TrapsError(
@@ -306,18 +306,18 @@ def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[Sh
 
 
 def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
-    """SHA-256 over the digests of all files of a split that training reads, in the order of the shards. For a shard
-    with more scenes than in the recipe, the digest is that of files with only the recipe's scenes."""
-    whole = hashlib.sha256()
+    """Return SHA-256 over the digests of all files of a split that training reads, in the order of the shards. For a
+    shard with more scenes than in the recipe, the digest is that of files with only the recipe's scenes."""
+    hasher = hashlib.sha256()
     for job, _ in read_shards(recipe, split, folder):
         for path in (job.lines, job.pixels) if split == "train" else (job.lines,):
             of_file = file_digest(path) if job.drawn == job.count else hashlib.sha256(_first(job, path)).hexdigest()
-            whole.update(of_file.encode())
-    return whole.hexdigest()
+            hasher.update(of_file.encode())
+    return hasher.hexdigest()
 
 
 def _first(job: ShardJob, path: Path) -> bytes:
-    """The content that a file of a shard would have if only `count` scenes had been drawn."""
+    """Return the content that a file of a shard would have if only `count` scenes had been drawn."""
     if path == job.lines:
         return b"".join(path.read_bytes().splitlines(keepends=True)[: job.count])
     stream = io.BytesIO()

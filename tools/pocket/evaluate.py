@@ -67,19 +67,19 @@ class AnswerCounts:
 
 
 def entry_of(checkpoint: Path) -> ModelEntry:
-    """The registry's entry of the pocket model with the weights of a folder."""
+    """Return the registry's entry of the pocket model with the weights of a folder."""
     entry = get_model(MODEL)
     return entry.model_copy(update={"params": entry.params | {"checkpoint": str(checkpoint)}})
 
 
 def held_out(recipe: Recipe, folder: Path, most: int | None = None) -> Iterator[Asked]:
-    """The questions about the held-out scenes, family by family: about all, or about the first `most` of each."""
-    taken: Counter[str] = Counter()
+    """Yield the questions about the held-out scenes, family by family: about all, or about the first `most` of each."""
+    counts: Counter[str] = Counter()
     for job, records in read_shards(recipe, "held-out", folder):
         for place, scene in enumerate(records):
-            if most is not None and taken[scene.family] >= most:
+            if most is not None and counts[scene.family] >= most:
                 continue
-            taken[scene.family] += 1
+            counts[scene.family] += 1
             control, void = (job.clip(place, side) for side in ("control", "void"))
             yield Asked(scene, "control", control, scene.asked.question, scene.asked.answer)
             yield Asked(scene, "visual", void, scene.visual.question, None)
@@ -104,11 +104,11 @@ def evaluate(
     correct, abstained, prior = n.copy(), n.copy(), n.copy()
     for start in range(0, len(asked), MAX_BATCH):
         some = asked[start : start + MAX_BATCH]
-        shown = {clip: sample(clip, entry.media) for clip in dict.fromkeys(one.clip for one in some)}
+        frames = {clip: sample(clip, entry.media) for clip in dict.fromkeys(one.clip for one in some)}
         for regime in regimes:
             system = system_prompt(regime)
             prompts: list[Prompt] = [
-                model.prompt(system, one.question, shown[one.clip].frames, shown[one.clip].times_s.tolist())
+                model.prompt(system, one.question, frames[one.clip].frames, frames[one.clip].times_s.tolist())
                 for one in some
             ]
             for one, answer in zip(some, _answers(model, prompts, max_new_tokens), strict=True):
@@ -136,7 +136,8 @@ def _is_right(one: Asked, answer: str) -> bool:
 
 
 def _commonest(asked: Sequence[Asked]) -> dict[str, str]:
-    """The commonest control answer of each family among these scenes; of several, the first in alphabetical order."""
+    """Return the commonest control answer of each family among these scenes; of several, the first in alphabetical
+    order."""
     counts: dict[str, Counter[str]] = {}
     for one in asked:
         if one.kind == "control" and one.truth is not None:
@@ -159,7 +160,7 @@ def write_cells(path: Path, cells: Sequence[AnswerCounts]) -> None:
 
 
 def read_cells(path: Path) -> list[AnswerCounts]:
-    """The counts of a CSV of `write_cells`. Raises TrapsError."""
+    """Return the counts of a CSV of `write_cells`. Raises TrapsError."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             return [
@@ -175,7 +176,7 @@ def read_cells(path: Path) -> list[AnswerCounts]:
 
 
 def markdown(cells: Sequence[AnswerCounts]) -> str:
-    """The model card's table: one row per family and regime, in percent, as means over training seeds."""
+    """Return the model card's table: one row per family and regime, in percent, as means over training seeds."""
     seeds = sorted({cell.seed for cell in cells})
     lines = [
         f"| {' | '.join(COLUMNS)} |",
@@ -199,6 +200,6 @@ def markdown(cells: Sequence[AnswerCounts]) -> str:
 
 
 def _spread(shares: Sequence[float]) -> str:
-    """The shares in percent: one value, or the mean of several with the lowest and the highest."""
+    """Return the shares in percent: one value, or the mean of several with the lowest and the highest."""
     mean = f"{100 * np.mean(shares):.1f}"
     return mean if len(shares) == 1 else f"{mean} ({100 * min(shares):.1f}-{100 * max(shares):.1f})"

@@ -55,12 +55,12 @@ FIELDS = tuple(field.name for field in fields(Figure))
 
 
 def figures_of(workspace: Workspace) -> list[Figure]:
-    """The figures of a finished workspace. Raises TrapsError when stages are missing, or when the seed of its weights
-    is not known."""
+    """Return the figures of a finished workspace. Raises TrapsError when stages are missing, or when the seed of its
+    weights is not known."""
     of = _seed_of(workspace)
     probes = workspace.tables.read(PROBES, {"model": MODEL, "prompt": "standard"})
     probes = probes.loc[probes["value"].notna() & (probes["scope"] == "all")]
-    found: list[Figure] = []
+    figures: list[Figure] = []
     for figure, analysis, flag in (
         ("transfer_best", "transfer", "own_best"),
         ("transfer_chosen", "transfer", "chosen"),
@@ -73,33 +73,33 @@ def figures_of(workspace: Workspace) -> list[Figure]:
         if analysis.startswith("answerable"):
             rows = rows.loc[rows["target"] == ANSWERABLE]
         copied = ["source", "target", "layer", "value", "low", "high"]
-        found += [Figure(**of, figure=figure, **row) for row in _records(rows[copied])]
+        figures += [Figure(**of, figure=figure, **row) for row in _records(rows[copied])]
     shuffled = probes.loc[probes["analysis"] == "shuffled"].groupby("source")["value"].mean().reset_index()
-    found += [Figure(**of, figure="shuffled", **row) for row in _records(shuffled)]
+    figures += [Figure(**of, figure="shuffled", **row) for row in _records(shuffled)]
     shares = workspace.tables.read(STEERING_SHARES, {})
     over_all = (shares[["path_set", "directions", "regime"]] == ALL).all(axis=1) & (shares["model"] == MODEL)
     shares = shares.rename(columns={"abstention": "value", "n_answers": "answers", "n_scenarios": "scenarios"})
     copied = ["kind", "layer", "alpha", "side", "value", "low", "high", "answers", "scenarios"]
-    found += [Figure(**of, figure="abstention", **row) for row in _records(shares.loc[over_all, copied])]
+    figures += [Figure(**of, figure="abstention", **row) for row in _records(shares.loc[over_all, copied])]
     truths = planted(workspace, MODEL)
-    return found + [Figure(**of, figure="planted", kind=name, value=round(v, 6)) for name, v in truths.items()]
+    return figures + [Figure(**of, figure="planted", kind=name, value=round(v, 6)) for name, v in truths.items()]
 
 
 def _records(rows: Any) -> list[dict[str, Any]]:
-    """The rows as plain numbers, rounded for the CSV."""
+    """Return the rows as plain numbers, rounded for the CSV."""
     return json.loads(rows.to_json(orient="records", double_precision=6))
 
 
 def _seed_of(workspace: Workspace) -> dict[str, Any]:
-    """Training seed and digest of the weights whose states a workspace has."""
+    """Return training seed and digest of the weights whose states a workspace has."""
     states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=MODEL)
-    found = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
-    if len(found) != 1:
+    checkpoints = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
+    if len(checkpoints) != 1:
         raise TrapsError(
-            f"{workspace.root}: has hidden states of {len(found)} checkpoints of {MODEL}, but should have one; run "
-            "`traps run mechanism` in a workspace of its own for each seed"
+            f"{workspace.root}: has hidden states of {len(checkpoints)} checkpoints of {MODEL}, but should have one; "
+            "run `traps run mechanism` in a workspace of its own for each seed"
         )
-    ((name, known),) = found
+    ((name, known),) = checkpoints
     folder = as_folder(name)
     if folder is None or not folder.is_dir() or folder_digest(folder) != known:
         raise TrapsError(
@@ -122,7 +122,7 @@ def write_figures(path: Path, figures: Sequence[Figure]) -> None:
 
 
 def read_figures(path: Path) -> list[Figure]:
-    """The figures of a CSV of `write_figures`. Raises TrapsError."""
+    """Return the figures of a CSV of `write_figures`. Raises TrapsError."""
     integers, numbers = ("seed", "layer", "answers", "scenarios"), ("alpha", "value", "low", "high")
     of: Mapping[str, Callable[[str], Any]] = {**dict.fromkeys(integers, int), **dict.fromkeys(numbers, float)}
     try:
@@ -142,14 +142,16 @@ def read_figures(path: Path) -> list[Figure]:
 
 
 def markdown(figures: Sequence[Figure]) -> str:
-    """The model card's tables: means over training seeds, with the lowest and the highest if there are several."""
+    """Return the model card's tables: means over training seeds, with the lowest and the highest if there are
+    several.
+    """
     seeds = sorted({figure.seed for figure in figures})
     parts = [*_planted(figures), *_probes(figures), "", *_steering(figures)]
     return "\n".join([*parts, "", f"Training seeds: {', '.join(map(str, seeds))}."])
 
 
 def _planted(figures: Sequence[Figure]) -> list[str]:
-    """What was planted and is found; nothing for weights in which nothing was."""
+    """Return what was planted and is found; nothing for weights in which nothing was."""
     lines = ["| planted | expected | found |", "|" + " --- |" * 3]
     for truth in TRUTHS:
         chosen = [figure for figure in figures if (figure.figure, figure.kind) == ("planted", truth.name)]
@@ -201,8 +203,8 @@ def _steering(figures: Sequence[Figure]) -> list[str]:
 
 
 def _over_seeds(figures: Sequence[Figure], times: float = 1, digits: int = 3) -> str:
-    """The mean over seeds, with the lowest and the highest if there are several; a seed's value is the mean of its
-    figures."""
+    """Return the mean over seeds, with the lowest and the highest if there are several; a seed's value is the mean of
+    its figures."""
     by_seed: dict[int, list[float]] = {}
     for figure in figures:
         by_seed.setdefault(figure.seed, []).append(times * figure.value)
@@ -218,7 +220,7 @@ def _layers(figures: Sequence[Figure]) -> str:
 
 
 def _range(numbers: Any) -> str:
-    """`4`, or `1-4`; empty where there is none."""
+    """Return `4`, or `1-4`; empty where there is none."""
     present = [number for number in numbers if number is not None]
     if not present:
         return ""

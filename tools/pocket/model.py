@@ -40,18 +40,18 @@ VISION = {
 
 
 def train_tokenizer(records: Iterable[SceneRecord]) -> Tokenizer:
-    """A byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, and `phrases`; it
-    splits any other text into smaller pieces."""
+    """Return a byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, and `phrases`;
+    it splits any other text into smaller pieces."""
     from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
 
-    made = Tokenizer(models.BPE())
-    made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)  # pyright: ignore[reportAttributeAccessIssue]
-    made.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)  # pyright: ignore[reportAttributeAccessIssue]
+    tokenizer.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
     alphabet = pre_tokenizers.ByteLevel.alphabet()
     trainer = trainers.BpeTrainer(vocab_size=VOCABULARY, initial_alphabet=sorted(alphabet), show_progress=False)
-    made.train_from_iterator(_texts(records), trainer)
-    made.add_tokens([AddedToken(phrase, normalized=False) for phrase in phrases()])
-    return made
+    tokenizer.train_from_iterator(_texts(records), trainer)
+    tokenizer.add_tokens([AddedToken(phrase, normalized=False) for phrase in phrases()])
+    return tokenizer
 
 
 def _texts(records: Iterable[SceneRecord]) -> Iterable[str]:
@@ -67,7 +67,7 @@ def _texts(records: Iterable[SceneRecord]) -> Iterable[str]:
 
 
 def make_model(tokenizer: Tokenizer, seed: int) -> tuple[Any, Any]:
-    """The untrained model and its processor. The same seed gives the same weights."""
+    """Return the untrained model and its processor. The same seed gives the same weights."""
     import torch
 
     transformers = load_transformers()

@@ -47,7 +47,7 @@ def _layer_0(group: str) -> Callable[[Workspace, str], float | None]:
 
 
 def _abstained(regime: str, dataset: str | None = None) -> Callable[[Workspace, str], float | None]:
-    """The share of abstentions on voids, mean over the four datasets; or on all items of one dataset."""
+    """Return the share of abstentions on voids, mean over the four datasets; or on all items of one dataset."""
 
     def of(workspace: Workspace, model: str) -> float | None:
         rows = workspace.tables.read_all(VERDICTS, ["dataset", "side", "abstained"], model=model, regime=regime)
@@ -60,7 +60,7 @@ def _abstained(regime: str, dataset: str | None = None) -> Callable[[Workspace, 
 
 
 def _own(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a dataset on itself, fitted without the scored scenario."""
+    """Return rows of a dataset on itself, fitted without the scored scenario."""
     return rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
 
 
@@ -93,7 +93,7 @@ def _gated_decoys(workspace: Workspace, model: str) -> float | None:
 
 
 def _beats_nulls(workspace: Workspace, model: str) -> float | None:
-    """The share of rows in which the void direction is ahead of at least 19 of 20 draws of a null."""
+    """Return the share of rows in which the void direction is ahead of at least 19 of 20 draws of a null."""
     rows = workspace.tables.read_all(STEERING_NULLS)
     rows = rows.loc[(rows["model"] == model) & (rows["target"] != "all")]
     return float((rows["p"] < 0.1).mean()) if len(rows) else None
@@ -117,6 +117,6 @@ TRUTHS = (
 
 
 def planted(workspace: Workspace, model: str) -> dict[str, float]:
-    """The figures of a finished study by the names of TRUTHS, without those that the study has not."""
-    found = {truth.name: truth.of(workspace, model) for truth in TRUTHS}
-    return {name: value for name, value in found.items() if value is not None}
+    """Return the figures of a finished study by the names of TRUTHS, without those that the study has not."""
+    truths = {truth.name: truth.of(workspace, model) for truth in TRUTHS}
+    return {name: value for name, value in truths.items() if value is not None}

@@ -36,7 +36,7 @@ class Training(BaseModel):
     pairs: dict[int, int] = Field(default_factory=dict)
 
     def pairs_at(self, step: int) -> int | None:
-        """How many pairs of frames are shown at a step; None for all."""
+        """Return how many pairs of frames are shown at a step; None for all."""
         begun = [first for first in self.pairs if first <= step]
         return self.pairs[max(begun)] if begun else None
 
@@ -72,13 +72,13 @@ class Recipe(BaseModel):
     training: Training
 
     def content(self, *only: str) -> dict[str, Any]:
-        """The settings (only: these) for a digest. One that came later counts only where it is used, so that what was
-        made before it keeps its digest."""
+        """Return the settings (only: these) for a digest. One that came later counts only where it is used, so that
+        what was made before it keeps its digest."""
         unused = {"abstain_share", "abstain_shares", "jitter", "decoys"} - self.model_fields_set
-        made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
-        if "training" in made and not self.training.pairs:
-            del made["training"]["pairs"]
-        return made | ({"media": self.media.content()} if "media" in made else {})
+        dumped = self.model_dump(mode="json", include={*only} or None, exclude=unused)
+        if "training" in dumped and not self.training.pairs:
+            del dumped["training"]["pairs"]
+        return dumped | ({"media": self.media.content()} if "media" in dumped else {})
 
     @field_validator("scenes")
     @classmethod
@@ -102,10 +102,10 @@ class Recipe(BaseModel):
         return self
 
     def count(self, family: str, split: Split) -> int:
-        """Scenes of a family in a split."""
+        """Return scenes of a family in a split."""
         return self.scenes[family] if split == "train" else self.held_out
 
 
 def load_recipe(path: Path = RECIPE) -> Recipe:
-    """The recipe. Raises TrapsError naming the field that is wrong."""
+    """Return the recipe. Raises TrapsError naming the field that is wrong."""
     return parse_yaml_model(Recipe, read_yaml(path), path)

@@ -43,12 +43,12 @@ class Shot:
     void_length: int | None
 
     def shown(self, first: int, length: int, spec: MediaSpec) -> np.ndarray:
-        """The simulation's frames that the model is shown of a clip with so many frames, from one of them on."""
+        """Return the simulation's frames that the model is shown of a clip with so many frames, from one of them on."""
         return first + pick(np.arange(length) / self.control.physics.fps, spec)
 
 
 def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = None) -> Shot:
-    """A random scene. Raises Rejected, as `scenes.draw.resolve` does, when it gives no valid pair."""
+    """Return a random scene. Raises Rejected, as `scenes.draw.resolve` does, when it gives no valid pair."""
     params = family.draw(rng)
     wording = family.word(params, rng)
     if parts := LOOKS.intersection(family.looks):
@@ -65,8 +65,8 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     cut = None if panel is not None else _draw_cut(outcome, physics.fps, rng)
     ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
     # A draw has one length: to try another one would take a certificate that says so.
-    whole, seed = World(family, params, physics, qpos, camera, panel), int(rng.integers(2**31))
-    control = _closed(cut_to(whole, lengths(whole, seed)[0]), seed)
+    world, seed = World(family, params, physics, qpos, camera, panel), int(rng.integers(2**31))
+    control = _closed(cut_to(world, lengths((world,), seed)[0]), seed)
     if control.outcome.label != outcome.label:
         raise Rejected("the clip ends before its outcome")
     span, held = (0, len(control.qpos)), None
@@ -79,9 +79,9 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
 
 
 def _closed(control: World, seed: int) -> World:
-    """The control as those of released scenarios end (`scenes.draw.closing`), but without a certificate: only the first
-    and the last frame behind the panel are looked at. The control as it is if no panel can close it."""
-    for frame in moments(control, seed):
+    """Return the control as those of released scenarios end (`scenes.draw.closing`), but without a certificate: only
+    the first and the last frame behind the panel are looked at. The control as it is if no panel can close it."""
+    for frame in moments((control,), seed):
         closing = replace(control, closing=Closing(frame, panel_from(frame, control)))
         with closing.closed_renderer() as renderer:
             if not renderer.visible_pixels(control.qpos[[frame, -1]], closing.closed_off, panel=True).any():
@@ -98,8 +98,8 @@ def _draw_cut(outcome: Outcome, fps: int, rng: np.random.Generator) -> int:
 
 
 def _jittered(jitter: Jitter, control: World, rng: np.random.Generator) -> tuple[tuple[int, int], int | None]:
-    """The frames of a chaotic control's clip, and the length of its void; the whole control and None for clips as they
-    are."""
+    """Return the frames of a chaotic control's clip, and the length of its void; the whole control and None for clips
+    as they are."""
     fps, n = control.physics.fps, len(control.qpos)
     short, held = rng.random(2) < (jitter.control, jitter.void)
     length = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
@@ -109,7 +109,8 @@ def _jittered(jitter: Jitter, control: World, rng: np.random.Generator) -> tuple
 
 
 def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises Rejected.
+    """Return the frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises
+    Rejected.
 
     A void that is held closes when its control does: else the panel alone would tell the sides of a chaotic pair.
     """
@@ -132,8 +133,8 @@ def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.
 
 
 def render_decoy(shot: Shot, spec: MediaSpec) -> list[np.ndarray] | None:
-    """The frames of the control, which no panel closes, with the void's panel behind everything, seen by a camera that
-    holds both; None if it hides anything decisive all the same, or is not seen itself."""
+    """Return the frames of the control, which no panel closes, with the void's panel behind everything, seen by a
+    camera that holds both; None if it hides anything decisive all the same, or is not seen itself."""
     control = shot.control
     if control.panel is None:
         return None

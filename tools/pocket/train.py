@@ -27,13 +27,13 @@ RARE = 2.0  # offset of the initial logits: most tokens lack most colours
 
 
 def look_at(model: Any, batch: Batch) -> Any:
-    """The output of the vision tower for a batch's clips."""
+    """Return the output of the vision tower for a batch's clips."""
     return model.model.get_video_features(batch.pixels, batch.grid, return_dict=True)
 
 
 def name_loss(model: Any, seen: Any, batch: Batch, words: torch.Tensor) -> torch.Tensor:
-    """The naming loss: the clips' tokens, as they enter the language model, should align with the embeddings of the
-    words for the contents of their square of the picture, and of no other words (binary cross-entropies, nats).
+    """Return the naming loss: the clips' tokens, as they enter the language model, should align with the embeddings of
+    the words for the contents of their square of the picture, and of no other words (binary cross-entropies, nats).
 
     Every word that names anything in a clip has the same weight, even if it applies to few squares. Otherwise a ball,
     which has one square, would have little weight beside boards and bins. words: from `name_tokens`.
@@ -50,7 +50,7 @@ def name_loss(model: Any, seen: Any, batch: Batch, words: torch.Tensor) -> torch
 
 
 def answer_loss(model: Any, seen: Any, batch: Batch) -> torch.Tensor:
-    """Negative log-likelihood of a row's answers (nats, summed over their tokens), mean over the rows."""
+    """Return negative log-likelihood of a row's answers (nats, summed over their tokens), mean over the rows."""
     from torch.nn.functional import cross_entropy
 
     length, rows = len(batch.head), len(batch.ids)
@@ -73,14 +73,17 @@ def answer_loss(model: Any, seen: Any, batch: Batch) -> torch.Tensor:
 
 
 def loss_at(step: int, model: Any, batch: Batch, words: torch.Tensor, training: Training) -> torch.Tensor:
-    """The loss at a step: at first the naming loss alone, since a model that cannot see cannot learn to answer."""
+    """Return the loss at a step: at first the naming loss alone, since a model that cannot see cannot learn to
+    answer.
+    """
     seen = look_at(model, batch)
     names = training.naming * name_loss(model, seen, batch, words)
     return names if step < training.naming_steps else names + answer_loss(model, seen, batch)
 
 
 def learning_rate(step: int, training: Training) -> float:
-    """Half a cosine down to zero over all steps, with a linear warm-up for the naming loss and again for answers."""
+    """Return half a cosine down to zero over all steps, with a linear warm-up for the naming loss and again for
+    answers."""
     since = step - training.naming_steps if step >= training.naming_steps else step
     warm = min(1.0, (since + 1) / max(1, training.warmup_steps))
     return training.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / training.steps))
@@ -177,8 +180,8 @@ def train(
             lately.append(loss.item())
             now = time.monotonic()
             if now - reported > PROGRESS_S or step == last:
-                left = (now - began) / (step - first) * (training.steps - step) / 60
-                report(f"step {step} of {training.steps}, loss {np.mean(lately):.3f}, {left:.0f} min left")
+                minutes_left = (now - began) / (step - first) * (training.steps - step) / 60
+                report(f"step {step} of {training.steps}, loss {np.mean(lately):.3f}, {minutes_left:.0f} min left")
                 reported, lately = now, []
             if now - kept > CHECKPOINT_S:
                 state.save(step)

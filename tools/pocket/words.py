@@ -27,7 +27,7 @@ _ANYTHING = ("the ball", "the wall", "the floor")
 
 
 def prompt_text(name: str) -> str:
-    """The system text of one of PROMPTS; `vqa_guided` is `vqa_standard` with its suffix (docs/spec.md 7.1)."""
+    """Return the system text of one of PROMPTS; `vqa_guided` is `vqa_standard` with its suffix (docs/spec.md 7.1)."""
     if name == "vqa_guided":
         return f"{prompt('vqa_standard')}\n\n{prompt('vqa_guided_suffix')}"
     return prompt("vqa_standard") if name == "vqa_standard" else system_prompt(name)
@@ -42,22 +42,23 @@ _JSON = {
 
 
 def say(answer: str | None, prompt_name: str) -> str:
-    """The words for an answer, or for an abstention (None). Both begin differently, so that the first token decides."""
+    """Return the words for an answer, or for an abstention (None). Both begin differently, so that the first token
+    decides."""
     if prompt_name == "json":
         return _JSON[True] if answer is None else f'{_JSON[False]}{answer}"}}'
     return ABSTENTION if answer is None else f"{ANSWER}{answer}."
 
 
 def phrases() -> list[str]:
-    """The texts that are single tokens: the lines of the prompts, and the words that all answers share. They keep
-    sequences short, which makes training on two cores possible."""
+    """Return the texts that are single tokens: the lines of the prompts, and the words that all answers share. They
+    keep sequences short, which makes training on two cores possible."""
     lines = [line for name in PROMPTS for line in prompt_text(name).splitlines() if line]
     return list(dict.fromkeys([*lines, ABSTENTION, ANSWER, *_JSON.values()]))
 
 
 def guess(question: str, labels: Sequence[str], rng: np.random.Generator) -> str:
-    """A plausible answer to a question that has no answer: a label, or for an ill-posed question a value of the kind
-    that it asks for."""
+    """Return a plausible answer to a question that has no answer: a label, or for an ill-posed question a value of the
+    kind that it asks for."""
     choices = labels or next((kind for opening, kind in _GUESSES if re.match(opening, question.lower())), _ANYTHING)
     return str(choices[int(rng.integers(len(choices)))])
 
@@ -66,9 +67,9 @@ COLUMNS, ROWS = "ABCDEFGH", "123456"  # of the picture, for questions of place
 
 
 def place_question(ball: str, place: Sequence[float], axis: int) -> tuple[str, str]:
-    """A question that is used only in training, to teach the model to locate objects, and its answer: the column (axis
-    0) or the row (axis 1) of the ball of a colour before a panel comes or the clip ends. place: shares of width and
-    height."""
+    """Return a question that is used only in training, to teach the model to locate objects, and its answer: the column
+    (axis 0) or the row (axis 1) of the ball of a colour before a panel comes or the clip ends. place: shares of width
+    and height."""
     names = (COLUMNS, ROWS)[axis]
     question = f"In which {('column', 'row')[axis]} of the picture is the {ball} ball when it is last seen?"
     return question, names[min(len(names) - 1, int(place[axis] * len(names)))]

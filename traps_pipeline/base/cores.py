@@ -9,5 +9,5 @@ CORES = "TRAPS_CORES"  # of a run on a cluster; set by who submits it
 
 def cores() -> int:
     """At least one."""
-    here, given = len(os.sched_getaffinity(0)), os.environ.get(CORES)
-    return min(here, max(1, int(given))) if given else here
+    here, setting = len(os.sched_getaffinity(0)), os.environ.get(CORES)
+    return min(here, max(1, int(setting))) if setting else here

@@ -10,26 +10,26 @@ from typing import Any
 
 
 def canonical_json(value: Any) -> str:
-    """JSON with sorted keys, no spaces and no NaN: equal values give equal text."""
+    """Return JSON with sorted keys, no spaces and no NaN: equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def digest(value: Any) -> str:
-    """Hexadecimal SHA-256 of a JSON-able value."""
+    """Return hexadecimal SHA-256 of a JSON-able value."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
 def digest_of_list(values: Iterable[Any]) -> str:
-    """`digest(list(values))`, one value held at a time: the text of a whole table would be a copy of it."""
-    whole, separator = hashlib.sha256(b"["), b""
+    """Return `digest(list(values))`, one value held at a time: the text of a whole table would be a copy of it."""
+    hasher, separator = hashlib.sha256(b"["), b""
     for value in values:
-        whole.update(separator + canonical_json(value).encode())
+        hasher.update(separator + canonical_json(value).encode())
         separator = b","
-    whole.update(b"]")
-    return whole.hexdigest()
+    hasher.update(b"]")
+    return hasher.hexdigest()
 
 
 def file_digest(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file's bytes."""
+    """Return hexadecimal SHA-256 of a file's bytes."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

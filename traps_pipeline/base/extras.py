@@ -33,24 +33,24 @@ EXTRAS: Mapping[ExtraName, Extra] = {
 
 
 def install_line(name: ExtraName) -> str:
-    """What to type to get an extra."""
+    """Return what to type to get an extra."""
     return f"python -m pip install 'traps-pipeline[{name}]'" if IS_INSTALLED else "make setup"
 
 
 def missing(name: ExtraName, *modules: str) -> list[str]:
-    """The modules of an extra (or only these of it) that are not installed. None of them is imported."""
+    """Return the modules of an extra (or only these of it) that are not installed. None of them is imported."""
     return [module for module in modules or EXTRAS[name].modules if find_spec(module) is None]
 
 
 def require(name: ExtraName, *modules: str) -> None:
-    """Raises TrapsError with the line to type unless an extra (or these modules of it) is installed. Call it before the
+    """Raise TrapsError with the line to type unless an extra (or these modules of it) is installed. Call it before the
     first import of it."""
     if absent := missing(name, *modules):
         raise TrapsError(_sentence(name, absent))
 
 
 def sentence_of(error: ModuleNotFoundError) -> str | None:
-    """The same sentence for an import that nobody looked after; None for a module of no extra."""
+    """Return the same sentence for an import that nobody looked after; None for a module of no extra."""
     module = (error.name or "").partition(".")[0]
     known: tuple[ExtraName, ...] = get_args(ExtraName)
     return next((_sentence(name, [module]) for name in known if module in EXTRAS[name].modules), None)

@@ -33,7 +33,7 @@ _REMEDIES = {
 
 
 def remedy(error: OSError) -> str:
-    """What a person can do about a file that cannot be read or written."""
+    """Return what a person can do about a file that cannot be read or written."""
     return _REMEDIES.get(error.errno or 0, "see to the file or its disk")
 
 
@@ -83,17 +83,19 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_in_place(descriptor: int, path: Path) -> bool:
-    """Whether an open file is still what its name stands for: a lock on one that was removed keeps nobody out."""
+    """Return whether an open file is still what its name stands for: a lock on one that was removed keeps nobody
+    out.
+    """
     try:
-        there, own = path.stat(), os.fstat(descriptor)
+        current, own = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
         return False
-    return (there.st_dev, there.st_ino) == (own.st_dev, own.st_ino)
+    return (current.st_dev, current.st_ino) == (own.st_dev, own.st_ino)
 
 
 def try_lock(path: Path) -> int | None:
-    """The descriptor of a lock file that this process now holds alone, until it is closed or the process ends; None
-    while another one holds it. Missing folders are made. Raises OSError."""
+    """Return the descriptor of a lock file that this process now holds alone, until it is closed or the process ends;
+    None while another one holds it. Missing folders are made. Raises OSError."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -115,7 +117,7 @@ def try_lock(path: Path) -> int | None:
 
 
 def require_in_place(descriptor: int, path: Path) -> None:
-    """Raises TrapsError where the file of a lock that this process holds was removed: another run may hold it too."""
+    """Raise TrapsError where the file of a lock that this process holds was removed: another run may hold it too."""
     if not is_in_place(descriptor, path):
         raise TrapsError(
             f"{path}: was removed while this run held it, so that another run may ask the same calls; nothing more is "
@@ -135,7 +137,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def is_same_file(one: Path, other: Path) -> bool:
-    """Whether two names stand for one file, which is there."""
+    """Return whether two names stand for one file, which is there."""
     try:
         return one.samefile(other)
     except FileNotFoundError:

@@ -33,7 +33,9 @@ def user_cache() -> Path:
 
 
 def require_root() -> Path:
-    """The folder that holds `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is missing."""
+    """Return the folder that holds `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is
+    missing.
+    """
     for folder in (ASSETS, SCENE_SPECS):
         if not folder.is_dir():
             raise TrapsError(
@@ -43,7 +45,7 @@ def require_root() -> Path:
 
 
 def require_own(path: Path, instead: str) -> Path:
-    """The path, if people may change what lies there. `instead` says what to do where they may not.
+    """Return the path, if people may change what lies there. `instead` says what to do where they may not.
 
     Raises TrapsError for a file or folder of an installed wheel: the next installation would overwrite what was
     written, and two studies would differ though they name the same version.
@@ -54,7 +56,7 @@ def require_own(path: Path, instead: str) -> Path:
 
 
 def require_own_corrections(folder: Path = CORRECTIONS) -> Path:
-    """The folder of corrections, if decisions may be written into it. Raises TrapsError."""
+    """Return the folder of corrections, if decisions may be written into it. Raises TrapsError."""
     return require_own(
         folder, f"copy {OWN_SPECS} to a folder of your own, set {SPECS_VARIABLE} to it, and decide there"
     )

@@ -101,9 +101,9 @@ def redact_tracebacks() -> None:
 
 def redacted(error: Exception) -> Exception:
     """Return an exception to raise in the place of one whose traceback would show a key; else the exception itself."""
-    shown = "".join(traceback.format_exception(error))
-    without = redact(shown)
-    return error if without == shown else RuntimeError(without).with_traceback(error.__traceback__)
+    text = "".join(traceback.format_exception(error))
+    without = redact(text)
+    return error if without == text else RuntimeError(without).with_traceback(error.__traceback__)
 
 
 @lru_cache(maxsize=8)
@@ -135,8 +135,8 @@ def _base64(secret: str) -> Iterator[str]:
     """Yield what base64 makes of a secret inside longer content: it begins at one of three places of a group."""
     content = secret.encode("utf-8", "surrogateescape")
     for before, skipped in ((0, 0), (1, 2), (2, 3)):
-        whole = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6]
-        yield from (whole, whole.replace("+", "-").replace("/", "_"))
+        encoded = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6]
+        yield from (encoded, encoded.replace("+", "-").replace("/", "_"))
 
 
 def _searched(text: str, is_decoded: bool) -> str:

@@ -42,7 +42,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only programs of this machine reach what listens there."""
+    """Return whether only programs of this machine reach what listens there."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -50,8 +50,8 @@ def is_loopback(host: str) -> bool:
 
 
 def token_for(host: str, given: str | None, *, danger: str, variable: str) -> str:
-    """The token of a server that listens there: the given one, or a fresh one. Raises TrapsError beyond this machine
-    without one, and for one that can be guessed.
+    """Return the token of a server that listens there: the given one, or a fresh one. Raises TrapsError beyond this
+    machine without one, and for one that can be guessed.
 
     danger: what everybody who reaches the address could do; variable: the environment variable that may hold a token.
     """
@@ -67,8 +67,8 @@ def token_for(host: str, given: str | None, *, danger: str, variable: str) -> st
 
 
 def public_name(address: str) -> str:
-    """The name, with a port where it has one, of the address of a server with HTTPS that stands before this one. Raises
-    TrapsError for anything else than `https://NAME[:PORT]`."""
+    """Return the name, with a port where it has one, of the address of a server with HTTPS that stands before this one.
+    Raises TrapsError for anything else than `https://NAME[:PORT]`."""
     parts = urlsplit(address)
     if parts.scheme != "https" or not parts.hostname or address.rstrip("/") != f"https://{parts.netloc}":
         raise TrapsError(
@@ -78,7 +78,8 @@ def public_name(address: str) -> str:
 
 
 def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
-    """A token of each person, made from one secret: it stays the same after a restart, and tells nothing of another."""
+    """Return a token of each person, made from one secret: it stays the same after a restart, and tells nothing of
+    another."""
 
     def own(who: str) -> str:
         return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
@@ -164,11 +165,11 @@ class Guard:
 
     def _owner(self, given: str | None) -> str | None:
         """Whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
-        found = None
+        owner = None
         for token, who in self._tokens.items():
             if given is not None and hmac.compare_digest(given.encode(), token.encode()):
-                found = who
-        return found
+                owner = who
+        return owner
 
     def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
         """Whose browser it is that was let in before, or whose token a program brings as `Authorization: Bearer TOKEN`;
@@ -184,15 +185,15 @@ class Guard:
 
     async def _enter(self, scope: Scope, send: Send) -> None:
         """Give the browser the token as a cookie and show the page without it: an address is seen and kept."""
-        left = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
-        place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(left)}" if left else "")
+        parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
+        place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
         cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
         headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode("latin-1"))]
         await _answer(send, 303, b"", headers)
 
 
 def _given_token(scope: Scope) -> str | None:
-    """The token in the address of a request."""
+    """Return the token in the address of a request."""
     return dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
 
 

@@ -63,9 +63,9 @@ def run_in_order(
     ahead: int | None = None,
     at_once: bool = False,
 ) -> Iterator[tuple[Job, Result]]:
-    """Results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is yielded,
-    and no more than `ahead` at a time, for who may want no further result soon. at_once: the next job is taken before a
-    result is yielded, so that no worker waits for what the caller does with it.
+    """Yield results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is
+    yielded, and no more than `ahead` at a time, for who may want no further result soon. at_once: the next job is taken
+    before a result is yielded, so that no worker waits for what the caller does with it.
 
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels what has not begun.
     """

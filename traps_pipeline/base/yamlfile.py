@@ -92,7 +92,7 @@ def _check_events(content: str) -> None:
 
 
 def read_yaml(path: Path) -> Any:
-    """Parsed YAML. Raises TrapsError naming file, line and the parser's complaint."""
+    """Return parsed YAML. Raises TrapsError naming file, line and the parser's complaint."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -110,7 +110,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Parsed YAML that is a mapping. Raises TrapsError."""
+    """Return parsed YAML that is a mapping. Raises TrapsError."""
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise TrapsError(f"{path}: must be a mapping of names, not {data!r:.60}; correct the file")
@@ -129,16 +129,16 @@ def within(path: Path) -> Iterator[None]:
 
 
 def _said(error: Exception) -> str:
-    """A parser's complaint on one line."""
+    """Return a parser's complaint on one line."""
     mark = getattr(error, "problem_mark", None)
     where = f"line {mark.line + 1}: " if mark is not None else ""
-    said = getattr(error, "problem", None) or str(error)
-    return where + plain(" ".join(said.split()))[:MOST_SAID]
+    problem = getattr(error, "problem", None) or str(error)
+    return where + plain(" ".join(problem.split()))[:MOST_SAID]
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """The lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError, also for JSON
-    that readers would take for different things."""
+    """Yield the lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError, also for
+    JSON that readers would take for different things."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
@@ -150,7 +150,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _check_line(line: str, where: str) -> None:
-    """Raises TrapsError for JSON that is ambiguous or without a bound. What is no JSON is left to the reader."""
+    """Raise TrapsError for JSON that is ambiguous or without a bound. What is no JSON is left to the reader."""
     try:
         if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:
             raise _Odd("too large, or nested too deeply")
@@ -171,11 +171,11 @@ class _Odd(Exception):
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
         names = [name for name, _ in pairs]
         raise _Odd(f"{next(name for name in names if names.count(name) > 1)!r} stands there twice")
-    return found
+    return fields
 
 
 def _finite(text: str) -> float:
@@ -186,7 +186,8 @@ def _finite(text: str) -> float:
 
 
 def _depth(line: str) -> int:
-    """How deep brackets are nested at most; those inside strings do not count. Every command reads some megabytes."""
+    """Return how deep brackets are nested at most; those inside strings do not count. Every command reads some
+    megabytes."""
     outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
     brackets = outside.encode().translate(None, _NO_BRACKETS)
     return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
@@ -197,16 +198,18 @@ def parse_yaml_model(
 ) -> Model:
     """Validate parsed YAML; validators see `context`. Raises TrapsError naming file, entry and field."""
     try:
-        made = model.model_validate(data, context=context)
+        parsed = model.model_validate(data, context=context)
     except ValidationError as error:
         raise TrapsError(f"{path}{where and ': ' + where}: {explain(error, model)}") from error
-    for field in _other_kinds(data, made):
+    for field in _other_kinds(data, parsed):
         raise TrapsError(f"{path}{where and ': ' + where}: {field}")
-    return made
+    return parsed
 
 
 def _other_kinds(data: Any, made: Any, name: str = "") -> Iterator[str]:
-    """Values that a model took for another kind than they are: true for 1, a text for a number; and no numbers."""
+    """Yield values that a model took for another kind than they are: true for 1, a text for a number; and no
+    numbers.
+    """
     if isinstance(made, float) and not math.isfinite(made):
         yield f"{name}: {made} is no finite number"
     number = isinstance(made, int | float) and not isinstance(made, bool)

@@ -43,7 +43,7 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
+    """Return verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
 
     Verdicts are kept under `kept` by record and code, so that a stopped call goes on where it was.
     """
@@ -60,10 +60,10 @@ def certify_all(
         verdicts.append(verdict)
         if not verdict.passed or done % 20 == 0 or done == len(cases):
             report(f"{done} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
-    found = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
-    whole = families is None and (folder / "composition.yaml").is_file()
-    found += problems(specs, load_composition(folder / "composition.yaml") if whole else None)
-    return verdicts, found + _alike(verdicts) + foreseeable(specs, verdicts)
+    failures = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
+    is_complete = families is None and (folder / "composition.yaml").is_file()
+    failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
+    return verdicts, failures + _alike(verdicts) + foreseeable(specs, verdicts)
 
 
 def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
@@ -75,14 +75,14 @@ def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
 
 @cache
 def code_digest(family: str) -> str:
-    """Digest of the code that certifies a family: verdicts of other code are not believed."""
+    """Return digest of the code that certifies a family: verdicts of other code are not believed."""
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])
 
 
 def judge(case: Case) -> Verdict:
-    """The verdict on one record, from its file if it is known."""
+    """Return the verdict on one record, from its file if it is known."""
     if case.verdict.is_file():
         return Verdict(**json.loads(case.verdict.read_text(encoding="utf-8")))
     spec = case.spec
@@ -97,39 +97,41 @@ def judge(case: Case) -> Verdict:
 
 
 def _alike(verdicts: Iterable[Verdict]) -> list[str]:
-    """Clips of different scenarios that end in the same frame: no clip may serve two scenarios."""
-    found = []
+    """Return clips of different scenarios that end in the same frame: no clip may serve two scenarios."""
+    problems = []
     for side in ("control_end", "void_end"):
         owners: defaultdict[str, list[str]] = defaultdict(list)
         for verdict in verdicts:
             if getattr(verdict, side):
                 owners[getattr(verdict, side)].append(verdict.scenario_id)
-        found += [f"{', '.join(ids)}: clips end in the same frame" for ids in owners.values() if len(ids) > 1]
-    return found
+        problems += [f"{', '.join(ids)}: clips end in the same frame" for ids in owners.values() if len(ids) > 1]
+    return problems
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Families of cut clips, of a hundred records or more, whose outcomes the state at the cut foretells."""
+    """Return families of cut clips, of a hundred records or more, whose outcomes the state at the cut foretells."""
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         if spec.scenario_id in states:
             families[spec.family].append(spec)
-    found = []
+    problems = []
     for family, members in families.items():
         outcomes = [spec.ground_truth for spec in members]
-        told = foretold([states[spec.scenario_id] for spec in members], outcomes) if len(members) >= FEWEST else None
-        if told is not None and told.gain > AT_MOST:
-            found.append(
-                f"{family}: the state at the cut foretells {told.best:.3f} of the outcomes, the commonest one is "
-                f"{told.prior:.3f}; at most {AT_MOST} more is allowed"
+        predicted = (
+            foretold([states[spec.scenario_id] for spec in members], outcomes) if len(members) >= FEWEST else None
+        )
+        if predicted is not None and predicted.gain > AT_MOST:
+            problems.append(
+                f"{family}: the state at the cut foretells {predicted.best:.3f} of the outcomes, the commonest one is "
+                f"{predicted.prior:.3f}; at most {AT_MOST} more is allowed"
             )
-    return found
+    return problems
 
 
 def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
-    """One line a family: scenarios, passed, draws rejected, entropy of the futures and how often the
-    best guess at them is right, margins, twins, CPU seconds."""
+    """Return one line a family: scenarios, passed, draws rejected, entropy of the futures and how often the best guess
+    at them is right, margins, twins, CPU seconds."""
     tallies = load_tallies(folder / "released")
     members: defaultdict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:

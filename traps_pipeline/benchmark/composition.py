@@ -27,7 +27,7 @@ class Composition(RootModel[dict[str, int]]):
 
 
 def load_composition(path: Path = SCENE_SPECS / "composition.yaml") -> dict[str, int]:
-    """Scenarios of each family. Raises TrapsError naming the file."""
+    """Return scenarios of each family. Raises TrapsError naming the file."""
     try:
         return Composition.model_validate(read_yaml(path)).root
     except ValidationError as error:
@@ -63,22 +63,22 @@ def sample_benchmark(
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """What is wrong with a set of records as a whole; one sentence each, naming the family.
+    """Return what is wrong with a set of records as a whole; one sentence each, naming the family.
 
     counts: the wanted number of scenarios of each family; not checked if None.
     """
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)
-    found = [] if counts is None else _wrong_counts(families, counts)
+    wrong = [] if counts is None else _wrong_counts(families, counts)
     for family, members in families.items():
-        found += _unbalanced(family, members)
-        found += _repeated_questions(family, members)
-        found += _constant_margin(family, members)
-    found += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
+        wrong += _unbalanced(family, members)
+        wrong += _repeated_questions(family, members)
+        wrong += _constant_margin(family, members)
+    wrong += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
     if counts is not None:
-        found += _predictable(specs)
-    return found
+        wrong += _predictable(specs)
+    return wrong
 
 
 def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[str, int]) -> list[str]:
@@ -90,13 +90,13 @@ def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[s
 
 
 def _unbalanced(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    found = []
+    wrong = []
     for answer, n in Counter(spec.ground_truth for spec in members).items():
         choices = [len(spec.labels) for spec in members if answer in spec.labels]
         most = answer_quota(len(members), len(members) / sum(1 / c for c in choices))  # the fair share of this answer
         if n > most:
-            found.append(f"{family}: answer {answer!r} occurs {n} times, at most {most} allowed")
-    return found
+            wrong.append(f"{family}: answer {answer!r} occurs {n} times, at most {most} allowed")
+    return wrong
 
 
 def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
@@ -106,7 +106,7 @@ def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
 
 
 def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    """A distance from another outcome that is the same in every scene is no distance: nothing is measured."""
+    """Return a distance from another outcome that is the same in every scene is no distance: nothing is measured."""
     margins = {spec.evidence.get("margin_m") for spec in members}
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
@@ -127,7 +127,7 @@ def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
-    """Accuracy of always giving a sub-scenario's commonest answer; occlusion and chaotic weighted equally."""
+    """Return accuracy of always giving a sub-scenario's commonest answer; occlusion and chaotic weighted equally."""
     commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
     shares = []
     for taxonomy in ("occlusion", "chaotic"):

@@ -56,7 +56,7 @@ class Correction(BaseModel):
     why: str = Field(min_length=1)
 
     def changes(self) -> dict[str, Any]:
-        """What the decision rewrites: words, answer, params."""
+        """Return what the decision rewrites: words, answer, params."""
         fields = (*WORDS, "answer", "params")
         return {f: v for f, v in self.model_dump(mode="json", include=set(fields)).items() if v is not None}
 
@@ -83,14 +83,14 @@ class Scenario:
         return digest([base, dict(self.words), dict(self.params) if self.params is not None else None])[:16]
 
     def changed_words(self) -> SceneSpec:
-        """The released record with the words of the corrections. Raises TrapsError naming the correction."""
+        """Return the released record with the words of the corrections. Raises TrapsError naming the correction."""
         if self.released is None:
             raise ValueError(f"{self.scenario_id} was added; it has no released record")
         return apply_words(self.released, self.words, self.where)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
-    """A record with other words; labels and answer are checked against each other. Raises TrapsError."""
+    """Return a record with other words; labels and answer are checked against each other. Raises TrapsError."""
     if not words:
         return spec
     record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}
@@ -104,24 +104,24 @@ def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneS
 
 
 def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
-    """All decisions with `file:line`. Raises TrapsError naming the line."""
-    found = []
+    """Return all decisions with `file:line`. Raises TrapsError naming the line."""
+    corrections = []
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
             where = f"{path}:{number}"
             try:
-                found.append((where, Correction.model_validate(json.loads(line))))
+                corrections.append((where, Correction.model_validate(json.loads(line))))
             except ValidationError as error:
                 raise TrapsError(
                     f"{where}: not a valid correction ({explain(error, Correction)}); correct that line"
                 ) from error
             except ValueError as error:
                 raise TrapsError(f"{where}: not JSON ({error}); correct that line") from error
-    return found
+    return corrections
 
 
 def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Correction]]) -> dict[str, Scenario]:
-    """The benchmark after all decisions, by scenario id in sorted order. Raises TrapsError naming the line."""
+    """Return the benchmark after all decisions, by scenario id in sorted order. Raises TrapsError naming the line."""
     scenarios = {
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
@@ -196,35 +196,37 @@ def _added(where: str, correction: Correction) -> Scenario:
 
 
 def load_scenarios(study: Study) -> dict[str, Scenario]:
-    """The scenarios of a study: folded, then the study's subset. Raises TrapsError for an unknown named scenario."""
+    """Return the scenarios of a study: folded, then the study's subset. Raises TrapsError for an unknown named
+    scenario."""
     check_benchmark(study)
     return subset(folded(), study)
 
 
 def check_benchmark(study: Study) -> None:
-    """Raises TrapsError unless the records in force are of the study's benchmark."""
-    there = "released" if SCENE_SPECS == OWN_SPECS else load_release().name
-    if study.benchmark != there:
+    """Raise TrapsError unless the records in force are of the study's benchmark."""
+    current = "released" if SCENE_SPECS == OWN_SPECS else load_release().name
+    if study.benchmark != current:
         raise TrapsError(
-            f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {there!r}; "
-            f"{_elsewhere(study.benchmark)}, or write `benchmark: {there}` into the experiment of a new workspace"
+            f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {current!r}; "
+            f"{_elsewhere(study.benchmark)}, or write `benchmark: {current}` into the experiment of a new workspace"
         )
 
 
 def _elsewhere(benchmark: str) -> str:
-    """Where the records of a benchmark are looked for, as a thing to do."""
+    """Return where the records of a benchmark are looked for, as a thing to do."""
     released = benchmark == "released"
     return f"unset {SPECS_VARIABLE}" if released else f"set {SPECS_VARIABLE} to the folder of {benchmark!r}"
 
 
 @cache
 def folded() -> dict[str, Scenario]:
-    """The released records after all corrections."""
+    """Return the released records after all corrections."""
     return fold(load_released(), read_corrections())
 
 
 def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenario]:
-    """Named scenarios, or the first n of each family, or all. Discarded ones fall away; no other takes their place."""
+    """Return named scenarios, or the first n of each family, or all. Discarded ones fall away; no other takes their
+    place."""
     if study.scenarios is not None:
         unknown = sorted(set(study.scenarios) - set(scenarios) - _ever_known())
         if unknown:
@@ -235,19 +237,19 @@ def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenari
         return dict(scenarios)
     families = {id_: spec.family for id_, spec in load_released().items()}
     families |= {id_: scenario.family for id_, scenario in scenarios.items()}
-    taken: dict[str, list[str]] = {}
+    by_family: dict[str, list[str]] = {}
     for id_, family in sorted(families.items()):
-        taken.setdefault(family, []).append(id_)
-    chosen = {id_ for ids in taken.values() for id_ in ids[: study.per_family]}
+        by_family.setdefault(family, []).append(id_)
+    chosen = {id_ for ids in by_family.values() for id_ in ids[: study.per_family]}
     return {id_: scenario for id_, scenario in scenarios.items() if id_ in chosen}
 
 
 def _ever_known() -> set[str]:
-    """Ids that are or were in the benchmark: released, added, discarded."""
+    """Return ids that are or were in the benchmark: released, added, discarded."""
     return set(load_released()) | {correction.scenario_id for _, correction in read_corrections()}
 
 
 def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:
-    """The categories that have scenarios, in their fixed order."""
+    """Return the categories that have scenarios, in their fixed order."""
     present = {scenario.category for scenario in scenarios.values()}
     return [category for category in ALL_CATEGORIES if category in present]

@@ -31,12 +31,12 @@ class DecidedMeanwhile(TrapsError):
 
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
-    """All decisions about a scenario, in order. Raises TrapsError for a file that cannot be read."""
+    """Return all decisions about a scenario, in order. Raises TrapsError for a file that cannot be read."""
     return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
 
 
 def is_reviewed(decisions: Sequence[Correction]) -> bool:
-    """Whether the last decision about a scenario stands: `restore` takes back those before it."""
+    """Return whether the last decision about a scenario stands: `restore` takes back those before it."""
     return bool(decisions) and decisions[-1].action != "restore"
 
 
@@ -72,7 +72,7 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
 
 
 def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
-    """The decisions after which a scenario is as it was before, and reviewed only if it was."""
+    """Return the decisions after which a scenario is as it was before, and reviewed only if it was."""
     if not is_released:
         if before is None:
             return [signed("discard")]  # it had been added
@@ -131,6 +131,6 @@ def _cut_torn_line(stream: Any) -> None:
     """Remove what a power cut left of a line that was never confirmed."""
     stream.seek(0)
     content = stream.read()
-    whole = content.rfind(b"\n") + 1
-    if whole != len(content):
-        stream.truncate(whole)
+    end = content.rfind(b"\n") + 1
+    if end != len(content):
+        stream.truncate(end)

@@ -48,11 +48,11 @@ class Finding:
 
     @staticmethod
     def read(path: Path, of: str) -> Finding | None:
-        """What is kept, if it is of this record and this code."""
+        """Return what is kept, if it is of this record and this code."""
         if not path.is_file():
             return None
-        found = Finding(**json.loads(path.read_text(encoding="utf-8")))
-        return found if found.of == of else None
+        finding = Finding(**json.loads(path.read_text(encoding="utf-8")))
+        return finding if finding.of == of else None
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Job:
 
 
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
-    """The arms and variations of a category's scenarios that some experiment of the study asks for."""
+    """Return the arms and variations of a category's scenarios that some experiment of the study asks for."""
     asked = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
     return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in asked]
 
@@ -82,8 +82,8 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
     def missing(rows: Sequence[Row]) -> list[Row]:
         every = [file for row in rows for file in files(row)]
         workspace.store.bring(file for file in every if file.name.endswith(_FOUND))
-        there = workspace.store.there(every)
-        return [row for row in rows if _missing(row, _clips(workspace, row, arms), there)]
+        existing = workspace.store.there(every)
+        return [row for row in rows if _missing(row, _clips(workspace, row, arms), existing)]
 
     def job(row: Row) -> Job | None:
         spec, clips = spec_of(row), _clips(workspace, row, arms)
@@ -110,8 +110,8 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
-    """Rows of the category's arms, all of which were filmed. Raises TrapsError for one that was not, and for a damaged
-    clip."""
+    """Return rows of the category's arms, all of which were filmed. Raises TrapsError for one that was not, and for a
+    damaged clip."""
     specs, arms = _specs(workspace, category), asked_arms(workspace, category)
     of_pairs = {
         (row["scenario_id"], row["side"]): row
@@ -138,12 +138,12 @@ def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Pat
     return {arm: workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for arm in arms}
 
 
-def _missing(row: Row, clips: Mapping[str, Path], there: set[Path]) -> bool:
-    """Whether the study lacks something of these arms of a scenario."""
+def _missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
+    """Return whether the study lacks something of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
-        found = Finding.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in there else None
-        if found is None or (found.frames and not {clip, note_of(clip)} <= there):
+        finding = Finding.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in existing else None
+        if finding is None or (finding.frames and not {clip, note_of(clip)} <= existing):
             return True
     return False
 
@@ -153,13 +153,13 @@ def _finding_of(clip: Path) -> Path:
 
 
 def _files(clip: Path) -> tuple[Path, ...]:
-    """The files of an arm: its clip with the note, which a refused one has not, and what was found."""
+    """Return the files of an arm: its clip with the note, which a refused one has not, and what was found."""
     return clip, note_of(clip), _finding_of(clip)
 
 
 @cache
 def _code(arm: str) -> str:
-    """The code that films an arm or a variation: after a change of it, it is filmed anew."""
+    """Return the code that films an arm or a variation: after a change of it, it is filmed anew."""
     name = "arms.py" if arm in ARM_NAMES else "variations.py"
     return file_digest(PACKAGE / "scenes" / "variants" / name)
 
@@ -171,7 +171,7 @@ def arm_of(spec: SceneSpec, arm: str) -> Arm:
 
 @cache
 def _partners(family: str) -> dict[str, SceneSpec]:
-    """The partners of a family's scenarios. A scenario whose scene was corrected or added has none."""
+    """Return the partners of a family's scenarios. A scenario whose scene was corrected or added has none."""
     members = [one for one in folded().values() if one.family == family]
     specs = {one.scenario_id: one.changed_words() for one in members if one.released and one.params is None}
     return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
@@ -183,9 +183,9 @@ def _of(spec: SceneSpec, arm: str) -> str:
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
-    """Whether an arm lies here as it was made, with its clip where it has one. Raises DamagedClip."""
-    found = Finding.read(_finding_of(clip), _of(spec, arm))
-    return found is not None and (not found.frames or read_clip(clip) is not None)
+    """Return whether an arm lies here as it was made, with its clip where it has one. Raises DamagedClip."""
+    finding = Finding.read(_finding_of(clip), _of(spec, arm))
+    return finding is not None and (not finding.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
@@ -273,10 +273,11 @@ def _shown_in_pair(row: Row) -> dict[str, Any]:
 
 
 def unmade(workspace: Workspace, category: str) -> list[str]:
-    """Why a category's table is not all that the study asks for: an arm that was not asked for then, a lost clip."""
+    """Return why a category's table is not all that the study asks for: an arm that was not asked for then, a lost
+    clip."""
     table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
-    there = set(table["arm"])
-    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in there]
+    present = set(table["arm"])
+    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]
     clips = sorted({str(clip) for clip in table["clip"].dropna()})
-    found = workspace.sizes(clips)
-    return reasons + [f"clip {clip} is gone" for clip in clips if clip not in found]
+    sizes = workspace.sizes(clips)
+    return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]

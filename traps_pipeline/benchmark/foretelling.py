@@ -33,7 +33,8 @@ class Foretold:
 
 
 def foretold(states: Sequence[Sequence[float] | np.ndarray], outcomes: Sequence[str]) -> Foretold | None:
-    """How well states (one a record, of any lengths) tell outcomes; None where some outcome is rarer than the folds."""
+    """Return how well states (one a record, of any lengths) tell outcomes; None where some outcome is rarer than the
+    folds."""
     from sklearn.ensemble import ExtraTreesClassifier
     from sklearn.linear_model import LogisticRegression
     from sklearn.model_selection import StratifiedKFold, cross_val_score

@@ -14,13 +14,13 @@ KEY_BYTES = 32
 
 
 def opaque(key: bytes, item_id: str) -> str:
-    """The name of a held-out item: without the key nobody can say which item it is."""
+    """Return the name of a held-out item: without the key nobody can say which item it is."""
     return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
 
 
 def held_out_key(path: Path, *, make: bool = False) -> bytes:
-    """The key of a held-out set, from its file of 64 hexadecimal digits; a missing one is drawn and written, readable
-    by its owner alone. Raises TrapsError."""
+    """Return the key of a held-out set, from its file of 64 hexadecimal digits; a missing one is drawn and written,
+    readable by its owner alone. Raises TrapsError."""
     if make and not path.exists():
         write_text(path, secrets.token_hex(KEY_BYTES) + "\n")
         path.chmod(0o600)

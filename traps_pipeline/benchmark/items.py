@@ -23,12 +23,12 @@ Record = Mapping[str, Any]
 
 
 def categories_of_dataset(dataset: str) -> list[str]:
-    """The categories whose scenarios make a dataset."""
+    """Return the categories whose scenarios make a dataset."""
     return [category for category in ALL_CATEGORIES if dataset in all_datasets_of(category)]
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
-    """Rows of a dataset's items. Clips are checked against their digests. Raises TrapsError."""
+    """Return rows of a dataset's items. Clips are checked against their digests. Raises TrapsError."""
     specs: list[Record] = []
     clips: dict[tuple[str, str], Record] = {}
     for category in categories_of_dataset(dataset):
@@ -77,7 +77,7 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 def _of_arm(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
-    """Items of an arm: of each scenario that admits it, what the arms table asks."""
+    """Return items of an arm: of each scenario that admits it, what the arms table asks."""
     rows = []
     for category in categories_of_dataset(arm):
         if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
@@ -114,7 +114,7 @@ def answer_type_of(labels: Sequence[str]) -> str:
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
-    """The commonest control answer of each sub-scenario; the first in alphabetical order where several are."""
+    """Return the commonest control answer of each sub-scenario; the first in alphabetical order where several are."""
     counts: dict[str, Counter[str]] = {}
     for spec in specs:
         counts.setdefault(spec["sub_scenario"], Counter())[spec["ground_truth"]] += 1
@@ -173,7 +173,7 @@ def _decisive(
     control_answer: str,
     media_digest: str,
 ) -> dict[str, Any]:
-    """All of an item that decides its answer or its score."""
+    """Return all of an item that decides its answer or its score."""
     return {
         "item_id": f"{dataset}:{spec['scenario_id']}:{side}",
         "pair_id": f"{dataset}:{spec['scenario_id']}",
@@ -200,7 +200,7 @@ _DECISIVE = (
 
 
 def item_hash(row: Record) -> str:
-    """Digest of all of an item that decides its answer or its score."""
+    """Return digest of all of an item that decides its answer or its score."""
     decisive = {name: row[name] for name in _DECISIVE}
     return digest(decisive | {"labels": list(row["labels"]), "aliases": json.loads(row["aliases"])})
 

@@ -34,7 +34,7 @@ def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
 
 @cache
 def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
-    """All released records by scenario id. Raises TrapsError naming file, line and what to do."""
+    """Return all released records by scenario id. Raises TrapsError naming file, line and what to do."""
     records: dict[str, SceneSpec] = {}
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
@@ -52,7 +52,7 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 
 def parse_record(line: str, where: str) -> SceneSpec:
-    """One line of a released file. Raises TrapsError."""
+    """Return one line of a released file. Raises TrapsError."""
     try:
         spec = SceneSpec.model_validate(json.loads(line))
     except ValidationError as error:

@@ -80,7 +80,7 @@ class _Sharing(Generic[Job]):
         return drawn, not self._left
 
     def _jobs(self) -> Iterator[Job]:
-        """Jobs of the rows that nobody else has, each leased when its job is asked for."""
+        """Yield jobs of the rows that nobody else has, each leased when its job is asked for."""
         for number in [*self._left]:
             lease = self._store.lease(f"{self._of.name}/{number:06d}")
             if lease is None:
@@ -106,11 +106,11 @@ class _Sharing(Generic[Job]):
 
 
 def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """What is known of those clips that are there; none of them is fetched for it. Raises DamagedClip where one is not
-    what its note says."""
-    wanted = [*clips]
-    store.bring(map(note_of, wanted))
-    digests = store.digests(wanted)
+    """Return what is known of those clips that are there; none of them is fetched for it. Raises DamagedClip where one
+    is not what its note says."""
+    paths = [*clips]
+    store.bring(map(note_of, paths))
+    digests = store.digests(paths)
     known = {path: note for path in digests if (note := read_note(path)) is not None}
     for path, note in known.items():
         if digests[path] != note.file_sha256:

@@ -24,7 +24,7 @@ COLUMNS = ("dataset", "cue", "n_pairs", "accuracy", "half_width")
 
 
 def shortcuts(items: pd.DataFrame, videos: pd.DataFrame, root: Path) -> pd.DataFrame:
-    """One row a dataset and cue: accuracy of telling side on held-out scenarios, 0.5 is chance.
+    """Return one row a dataset and cue: accuracy of telling side on held-out scenarios, 0.5 is chance.
 
     items are ITEMS rows, videos VIDEOS rows, clips lie under root. Columns: dataset, cue, n_pairs, accuracy, half_width
     (of a 95 % normal interval over pairs). Every scenario is predicted by a classifier that was fitted on the others
@@ -64,7 +64,7 @@ def _cues(clips: pd.DataFrame, root: Path) -> Mapping[str, tuple[Features, Calla
 
 
 def _hits(items: pd.DataFrame, features: np.ndarray, model: Pipeline) -> np.ndarray:
-    """Share of its two sides told rightly, for each pair (0, 0.5 or 1)."""
+    """Return share of its two sides told rightly, for each pair (0, 0.5 or 1)."""
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
     void = (items["side"] == "void").to_numpy()

@@ -36,7 +36,9 @@ class Resolved:
 
 
 def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
-    """The record after corrections. Only a changed or added scene is simulated, once; everything else is read."""
+    """Return the record after corrections. Only a changed or added scene is simulated, once; everything else is
+    read.
+    """
     if scenario.params is None:
         spec = scenario.changed_words()
         return Resolved(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
@@ -55,7 +57,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
 
 
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
-    """The scene that a correction's parameters make, with the family's words for it; simulated once and kept."""
+    """Return the scene that a correction's parameters make, with the family's words for it; simulated once and kept."""
     name = _resolved_name(scenario)
     own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(own)
@@ -96,7 +98,7 @@ def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
 
 
 def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
-    """The family's words for some parameters, always drawn in the same way for a scenario. Raises ValueError or
+    """Return the family's words for some parameters, always drawn in the same way for a scenario. Raises ValueError or
     TypeError where the family has no such parameters."""
     family = get_family(family_name)
     rng = np.random.default_rng([seed, *scenario_id.encode()])
@@ -104,7 +106,7 @@ def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[st
 
 
 def _words_still_fit(scenario: Scenario) -> bool:
-    """Whether the released words fit the corrected parameters: the family has the same words for both."""
+    """Return whether the released words fit the corrected parameters: the family has the same words for both."""
     released = scenario.released
     return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
 
@@ -122,7 +124,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         physics = Physics(**_physics(scenario))
         rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
         question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
-        found = resolve(
+        resolved = resolve(
             family,
             params,
             wording,
@@ -131,7 +133,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
             seed=_seed(scenario),
             physics=physics,
         )
-        return found.spec, found.qpos, found.twin
+        return resolved.spec, resolved.qpos, resolved.twin
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
@@ -145,7 +147,8 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[Resolved]]:
-    """Rows of scene_specs of a category, and the resolved records behind them. Trajectories are checked by digest."""
+    """Return rows of scene_specs of a category, and the resolved records behind them. Trajectories are checked by
+    digest."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
     released = released_in_study(workspace, category).values()
@@ -173,18 +176,18 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
-    """Released records of a category that the study would have without any correction."""
+    """Return released records of a category that the study would have without any correction."""
     plain = subset(fold(load_released(), ()), workspace.study)
     return {id_: s.released for id_, s in plain.items() if s.category == category and s.released is not None}
 
 
 def released_version(workspace: Workspace, category: str) -> str:
-    """Version of a category's released records in a study."""
+    """Return version of a category's released records in a study."""
     return digest([spec.spec_hash for spec in released_in_study(workspace, category).values()])[:16]
 
 
 def corrections_version(workspace: Workspace, category: str) -> str:
-    """Version of what the review decisions have made of a category's scenarios in a study."""
+    """Return version of what the review decisions have made of a category's scenarios in a study."""
     scenarios = load_scenarios(workspace.study).values()
     return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
 
@@ -217,13 +220,13 @@ def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
 
 
 def _relative(path: Path, *roots: Path) -> str:
-    """The path relative to the first root it lies under; as it is under none (a benchmark of one's own)."""
+    """Return the path relative to the first root it lies under; as it is under none (a benchmark of one's own)."""
     root = next((root for root in roots if path.is_relative_to(root)), None)
     return (path.relative_to(root) if root else path).as_posix()
 
 
 def spec_of(row: Mapping[str, Any]) -> SceneSpec:
-    """A row of scene_specs back to its record."""
+    """Return a row of scene_specs back to its record."""
     record = {name: row[name] for name in SceneSpec.model_fields}
     for name in (*_AS_JSON, "evidence"):
         record[name] = json.loads(record[name])
@@ -232,7 +235,7 @@ def spec_of(row: Mapping[str, Any]) -> SceneSpec:
 
 
 def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """The frozen qpos (F, nq) of a row of scene_specs, or its twin's. Raises TrapsError."""
+    """Return the frozen qpos (F, nq) of a row of scene_specs, or its twin's. Raises TrapsError."""
     candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])
     try:
@@ -243,7 +246,7 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
 
 
 def unsettled(resolved: Sequence[Resolved]) -> list[str]:
-    """Problems with outcomes: the certificate `outcome`, measured again from each frozen trajectory."""
+    """Return problems with outcomes: the certificate `outcome`, measured again from each frozen trajectory."""
     from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 
     problems = []
@@ -253,9 +256,9 @@ def unsettled(resolved: Sequence[Resolved]) -> list[str]:
             continue  # the reviewer's answer stands above the simulator's
         qpos = load_trajectory(item.trajectory, spec.trajectory_sha256)
         pair = pair_of(spec, qpos, qpos[:0])
-        found = OUTCOME.measured(pair)
+        evidence = OUTCOME.measured(pair)
         # Nothing is simulated here, so this machine's arithmetic may be another one than the record's.
-        failure = OUTCOME.failure(found, pair.claim) or OUTCOME.contradiction(found, spec.evidence, exact=False)
+        failure = OUTCOME.failure(evidence, pair.claim) or OUTCOME.contradiction(evidence, spec.evidence, exact=False)
         if failure is not None:
             problems.append(f"{spec.scenario_id}: {failure}")
     return problems

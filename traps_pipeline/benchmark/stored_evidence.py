@@ -18,12 +18,12 @@ _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a traje
 
 
 def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
-    """Records whose evidence does not certify the control; one sentence for each certificate that is lost."""
+    """Return records whose evidence does not certify the control; one sentence for each certificate that is lost."""
     return list(_lost(specs, "control"))
 
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
-    """Records whose evidence does not certify the void; one sentence for each certificate that is lost."""
+    """Return records whose evidence does not certify the void; one sentence for each certificate that is lost."""
     return list(_lost(specs, "void", "twin", "worlds"))
 
 
@@ -37,12 +37,12 @@ def _lost(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:
 
 
 def answerable_ill_posed(specs: Iterable[SceneSpec]) -> list[str]:
-    """Records whose ill-posed question nothing refutes, or whose well-posed one something does."""
-    found = []
+    """Return records whose ill-posed question nothing refutes, or whose well-posed one something does."""
+    problems = []
     for spec in specs:
         pair = pair_of(spec, _NO_FRAMES, _NO_FRAMES)
         for certificate in certificates_for(spec.void_kind, "words"):
             failure = certificate.failure(certificate.measured(pair), pair.claim)
             if failure is not None:
-                found.append(f"{spec.scenario_id}: {failure}")
-    return found
+                problems.append(f"{spec.scenario_id}: {failure}")
+    return problems

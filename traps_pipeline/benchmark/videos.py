@@ -30,8 +30,8 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
     specs = _specs(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
-        there = workspace.store.there(file for row in rows for file in _files(workspace, row))
-        return [row for row in rows if not there.issuperset(_files(workspace, row))]
+        existing = workspace.store.there(file for row in rows for file in _files(workspace, row))
+        return [row for row in rows if not existing.issuperset(_files(workspace, row))]
 
     rendered = ClipCache.of_user()
 
@@ -69,7 +69,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
-    """Rows of the category's clips, which are all there, and the leaked pixels of each occluded void. Raises
+    """Return rows of the category's clips, which are all there, and the leaked pixels of each occluded void. Raises
     TrapsError for a clip that is not."""
     specs = _specs(workspace, category)
     try:
@@ -135,9 +135,9 @@ def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: 
 
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Clips of the category's table that are gone or have another size: reasons for `traps status`."""
+    """Return clips of the category's table that are gone or have another size: reasons for `traps status`."""
     table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
-    wanted = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
-    notes = {path: workspace.relative(note_of(workspace.root / path)) for path in wanted}
-    found = workspace.sizes([*wanted, *notes.values()])
-    return [path for path, size in wanted.items() if found.get(path) != size or notes[path] not in found]
+    expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
+    notes = {path: workspace.relative(note_of(workspace.root / path)) for path in expected}
+    sizes = workspace.sizes([*expected, *notes.values()])
+    return [path for path, size in expected.items() if sizes.get(path) != size or notes[path] not in sizes]

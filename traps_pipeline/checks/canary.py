@@ -58,8 +58,8 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """The items of the canary: of each dataset of the pairs those with the smallest digests, so that they stay the same
-    while the benchmark does. Raises TrapsError where no items are made."""
+    """Return the items of the canary: of each dataset of the pairs those with the smallest digests, so that they stay
+    the same while the benchmark does. Raises TrapsError where no items are made."""
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
@@ -78,8 +78,8 @@ class _Asked(Call):
 
 
 def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
-    """CANARY rows of all epochs, after asking these models over the network what they were not asked in the study's
-    epoch; the table is written. Raises what asking raises."""
+    """Return CANARY rows of all epochs, after asking these models over the network what they were not asked in the
+    study's epoch; the table is written. Raises what asking raises."""
     epoch, items = workspace.study.epoch, canary_items(workspace)
     entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
     calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]
@@ -90,12 +90,12 @@ def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
     new = list[CanaryRow]()
     if calls:
         (new,) = collect(workspace, "canary", workspace.answers, entries, [CELL], lambda _: calls, finish)
-    made = pd.DataFrame([vars(row) for row in new], columns=pd.Index(CANARY.names))
+    rows = pd.DataFrame([vars(row) for row in new], columns=pd.Index(CANARY.names))
     if workspace.tables.state(CANARY, {}) is not None:
         old = workspace.tables.read(CANARY, {})
-        made = pd.concat([old.loc[~old["epoch"].eq(epoch) | ~old["model"].isin(models)], made], ignore_index=True)
-    workspace.tables.write(CANARY, {}, made, {})
-    return made
+        rows = pd.concat([old.loc[~old["epoch"].eq(epoch) | ~old["model"].isin(models)], rows], ignore_index=True)
+    workspace.tables.write(CANARY, {}, rows, {})
+    return rows
 
 
 def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], epoch: str) -> Any:
@@ -121,24 +121,24 @@ def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
 
 
 def changes(rows: pd.DataFrame) -> pd.DataFrame:
-    """What changed from each epoch of a model to its next one, from CANARY rows: model, from, to, served (names then
-    and now), n (items asked in both), outcome, abstained and value (numbers of items that changed in it), tokens (mean
-    change of prompt tokens)."""
+    """Return what changed from each epoch of a model to its next one, from CANARY rows: model, from, to, served (names
+    then and now), n (items asked in both), outcome, abstained and value (numbers of items that changed in it), tokens
+    (mean change of prompt tokens)."""
     by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # of each model, in the order of asking
     for row in rows.sort_values(["model", "created_at"], kind="stable").to_dict("records"):
         by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
-    found = list[dict[str, Any]]()
+    changed = list[dict[str, Any]]()
     for model, epochs in by_epoch.items():
         for then, now in pairwise(epochs):
             both = [(epochs[then][item], row) for item, row in epochs[now].items() if item in epochs[then]]
             served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
             tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _counted(old, new)]
-            found.append(
+            changed.append(
                 {"model": model, "from": then, "to": now, "served": " -> ".join(served), "n": len(both)}
                 | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
-    return pd.DataFrame(found, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
+    return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
 
 
 def _counted(*rows: Mapping[str, Any]) -> bool:
@@ -146,14 +146,14 @@ def _counted(*rows: Mapping[str, Any]) -> bool:
 
 
 def _said(value: Any) -> str:
-    """A value of a table for comparison; null equals null, however a file brings it back."""
+    """Return a value of a table for comparison; null equals null, however a file brings it back."""
     return "" if pd.isna(value) else str(value)
 
 
 def changes_text(rows: pd.DataFrame) -> str:
-    """The changes as a table for a person; a sentence where no model was asked in two epochs."""
+    """Return the changes as a table for a person; a sentence where no model was asked in two epochs."""
     table = changes(rows)
     if table.empty:
         return "canary: asked in this epoch; name another epoch in study.yaml to ask again, and what changed is shown"
-    shown = [[*row[:-1], "-" if row[-1] != row[-1] else f"{row[-1]:+.1f}"] for row in table.itertuples(index=False)]
-    return "canary: items that changed\n" + text_table(list(table), shown)
+    cells = [[*row[:-1], "-" if row[-1] != row[-1] else f"{row[-1]:+.1f}"] for row in table.itertuples(index=False)]
+    return "canary: items that changed\n" + text_table(list(table), cells)

@@ -40,7 +40,7 @@ class Finding:
 
 
 def examine(place: Place) -> Iterator[Finding]:
-    """One finding for each requirement of the demo."""
+    """Yield one finding for each requirement of the demo."""
     for what, look in (
         ("python", _python),
         ("checkout", _checkout),
@@ -56,8 +56,9 @@ def examine(place: Place) -> Iterator[Finding]:
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """One finding for each requirement of local models: the three families on tiny checkpoints, devices and weights,
-    and what looking into a model takes for granted, of those and of the models of the registry that are named."""
+    """Yield one finding for each requirement of local models: the three families on tiny checkpoints, devices and
+    weights, and what looking into a model takes for granted, of those and of the models of the registry that are named.
+    """
     from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
@@ -88,7 +89,7 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
 
 
 def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
-    """One finding for each check of a model; one alone where it cannot be loaded."""
+    """Yield one finding for each check of a model; one alone where it cannot be loaded."""
     from traps_pipeline.mechanism.adapter_checks import CHECKS
 
     try:
@@ -101,21 +102,21 @@ def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
 
 
 def examine_files(place: Place) -> Iterator[Finding]:
-    """Every file of a study that says what it must hold, read whole: one finding for each kind."""
+    """Yield every file of a study that says what it must hold, read whole: one finding for each kind."""
     from traps_pipeline.storage.workspace import Workspace
 
     workspace = Workspace.open(place)
-    store, lost = workspace.store, list[str]()
+    store, missing = workspace.store, list[str]()
     remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
     for path in (path for below in remote for path in below):  # fetched, and held against their digests
         try:
             store.here(path)
         except TrapsError as error:
-            lost.append(str(error))
+            missing.append(str(error))
     for folder in FOLDERS:
         workspace.bring_folder(workspace.root / folder)
     if workspace.is_shared:
-        yield Finding(not lost, "store", "; ".join(lost[:SHOWN]) or "every object is what was written")
+        yield Finding(not missing, "store", "; ".join(missing[:SHOWN]) or "every object is what was written")
     for what, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
@@ -127,17 +128,18 @@ def examine_files(place: Place) -> Iterator[Finding]:
         ),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
     ):
-        damaged = [said for path in files if (said := damage_of(path))]
-        shown = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
-        yield Finding(not damaged, what, shown or f"{len(files)} files are what was written")
-    said = [*workspace.answers.damage(), *workspace.votes.damage()]
-    yield Finding(not said, "ledger", "; ".join(said[:SHOWN]) or "all rows are what was written")
+        damaged = [message for path in files if (message := damage_of(path))]
+        summary = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
+        yield Finding(not damaged, what, summary or f"{len(files)} files are what was written")
+    message = [*workspace.answers.damage(), *workspace.votes.damage()]
+    yield Finding(not message, "ledger", "; ".join(message[:SHOWN]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """The objects in a study's store that nobody names and that are older than the grace period, and which of them were
-    removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be used."""
+    """Return the objects in a study's store that nobody names and that are older than the grace period, and which of
+    them were removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be
+    used."""
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
@@ -147,11 +149,11 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             f"{place}: a study in a folder has no objects that nobody names; give the address of one in an object "
             "store with --workspace s3://BUCKET/STUDY"
         )
-    shown = workspace.store.unused(is_removed=is_removed)
-    what = f"{len(shown)} objects ({sum(one.size for one in shown) / 1e6:.1f} MB)"
-    if shown:
-        what += f", the oldest of {shown[0].at:%Y-%m-%d}: {', '.join(one.name for one in shown[:SHOWN])}"
-        what += ", .." * (len(shown) > SHOWN)
+    unused = workspace.store.unused(is_removed=is_removed)
+    what = f"{len(unused)} objects ({sum(one.size for one in unused) / 1e6:.1f} MB)"
+    if unused:
+        what += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(one.name for one in unused[:SHOWN])}"
+        what += ", .." * (len(unused) > SHOWN)
     done = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
         True, "unused", f"{done}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {what}"
@@ -194,13 +196,13 @@ def _damaged_states(path: Path) -> str:
 
 
 def _damaged_history(path: Path) -> str:
-    """A damaged history is no loss: it is put aside and begun anew when the next command opens it."""
+    """Return a damaged history is no loss: it is put aside and begun anew when the next command opens it."""
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
-            (said,) = opened.execute("pragma quick_check(1)").fetchone()
+            (result,) = opened.execute("pragma quick_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
-        said = str(error)
-    return "" if said == "ok" else f"{path}: {said}; what counts stands in the tables"
+        result = str(error)
+    return "" if result == "ok" else f"{path}: {result}; what counts stands in the tables"
 
 
 def _remove_unfinished(root: Path) -> str:

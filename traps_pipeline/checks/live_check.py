@@ -69,9 +69,9 @@ class Live:
     @property
     def line(self) -> str:
         """What came of it, in a line for each finding."""
-        found = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
+        lines = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
         head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
-        return redact("\n".join([head, *(f"     {line}" for line in found)]))
+        return redact("\n".join([head, *(f"     {line}" for line in lines)]))
 
 
 @cache
@@ -89,17 +89,17 @@ def _clip(spec: MediaSpec) -> Media:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """The calls to an entry, by name. They hold the time: an answer of yesterday says nothing of today."""
+    """Return the calls to an entry, by name. They hold the time: an answer of yesterday says nothing of today."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
-        made = {
+        requests = {
             f"{task} {k}": vote_request(entry, task, CELL, _ITEM, text)
             for task in tasks
             for k, (text, abstained, _) in enumerate(_JUDGED)
             if task == "abstention" or not abstained
         }
-        return {name: replace(one, about={**one.about, "check": name, "at": now}) for name, one in made.items()}
+        return {name: replace(one, about={**one.about, "check": name, "at": now}) for name, one in requests.items()}
     assert isinstance(entry, ModelEntry)
     sent = _clip(entry.media) if entry.media else None
     forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
@@ -124,7 +124,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 
 
 def served_name(entry: Entry) -> str:
-    """The name that a model has at its provider."""
+    """Return the name that a model has at its provider."""
     return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
 
 
@@ -190,7 +190,7 @@ def _listed(answer: Any) -> list[Any]:
 
 
 def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
-    """What the outcomes of `requests_of` say of an entry, and what was found before them."""
+    """Return what the outcomes of `requests_of` say of an entry, and what was found before them."""
     problems, notes, before = list[str](), list[str](), reached or Reached()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and served_name(entry) not in answering:
@@ -296,7 +296,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
 
 
 def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
-    """Whether the clip arrives: its two colours are named, or its tokens are counted."""
+    """Return whether the clip arrives: its two colours are named, or its tokens are counted."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
@@ -374,14 +374,14 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
             return {key: _outcome(row) for key, row in settled.rows.items()}
 
         (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
-    found = []
+    problems = []
     for entry in entries:
         if problem := reached[entry.id].problem:
-            found.append(Live(entry, [problem]))
+            problems.append(Live(entry, [problem]))
         else:
             mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
-            found.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
-    return found
+            problems.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
+    return problems
 
 
 def _outcome(row: Row) -> Outcome:
@@ -389,9 +389,9 @@ def _outcome(row: Row) -> Outcome:
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 
-def require_sound(found: Sequence[Live]) -> None:
-    """Raises TrapsError that names everything that is wrong with anybody."""
-    wrong = [f"{one.entry.id}: {problem}" for one in found for problem in one.problems]
+def require_sound(results: Sequence[Live]) -> None:
+    """Raise TrapsError that names everything that is wrong with anybody."""
+    wrong = [f"{one.entry.id}: {problem}" for one in results for problem in one.problems]
     if wrong:
         more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
         raise TrapsError("\n".join([*wrong, more]))

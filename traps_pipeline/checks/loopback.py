@@ -25,7 +25,7 @@ class _Loopback(Account):
     """An account whose provider is this machine."""
 
     def secret(self) -> str | None:
-        """A placeholder for the key."""
+        """Return a placeholder for the key."""
         return PLACEHOLDER_KEY
 
 
@@ -49,13 +49,13 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
     """A server on this machine: its address and the requests that reach it. Each gets the next of these answers, a
     status and JSON, or a final 400."""
     caught: list[WireBody] = []
-    given = repeat(_CAUGHT) if answers is None else answers
+    replies = repeat(_CAUGHT) if answers is None else answers
 
     class Catcher(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             raw = self.rfile.read(int(self.headers.get("content-length") or 0))
             caught.append(WireBody(self.command, self.path, dict(self.headers), raw))
-            status, answer = next(given, _CAUGHT)
+            status, answer = next(replies, _CAUGHT)
             self.send_response(status)
             self.send_header("content-type", "application/json")
             self.send_header("content-length", str(len(answer)))
@@ -75,7 +75,7 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """The outcome of each request if its provider answered it with this status and JSON."""
+    """Return the outcome of each request if its provider answered it with this status and JSON."""
     account = load_accounts()[str(entry.account)]
     with _listening(iter(answers)) as (address, _), reporting(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
@@ -94,7 +94,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
 
 
 def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
-    """The body of each request, or why none was sent."""
+    """Return the body of each request, or why none was sent."""
     account, notes = load_accounts()[str(entry.account)], _Notes()
     with _listening() as (address, caught), reporting(notes):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)

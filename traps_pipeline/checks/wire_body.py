@@ -72,7 +72,7 @@ class ParsedBody:
 
 
 def read_body(wire: WireBody) -> ParsedBody:
-    """The parsed body. Raises one of `UNKNOWN_FORM` if its form is unknown."""
+    """Return the parsed body. Raises one of `UNKNOWN_FORM` if its form is unknown."""
     body = _camel(wire.body) if wire.api == "gemini" else dict(wire.body)
     model = body.pop("model", None) or wire.path.rsplit("/", 1)[-1].removesuffix(":generateContent")
     match wire.api:
@@ -93,7 +93,7 @@ def _turn(turn: Mapping[str, Any]) -> tuple[str, list[str | ClipPart | None]]:
 
 
 def _part(part: Mapping[str, Any]) -> str | ClipPart | None:
-    """A part of a turn, in the form of any of the APIs; None for an unknown kind of part."""
+    """Return a part of a turn, in the form of any of the APIs; None for an unknown kind of part."""
     match part:
         case {"text": str(text), **rest} if rest.keys() <= {"type"}:
             return text
@@ -114,7 +114,7 @@ def _clip(uri: str, fps: float | None = None) -> ClipPart:
 
 
 def _camel(value: Any) -> Any:
-    """The value with Gemini's names in camelCase: Gemini accepts snake_case too, and litellm mixes both."""
+    """Return the value with Gemini's names in camelCase: Gemini accepts snake_case too, and litellm mixes both."""
     if isinstance(value, list):
         return [_camel(one) for one in value]
     if not isinstance(value, dict):
@@ -129,7 +129,7 @@ def _camel_name(name: str) -> str:
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Leaves of nested mappings by dotted name."""
+    """Return leaves of nested mappings by dotted name."""
     if not isinstance(value, dict) or not value or name in SCHEMAS:
         return {name: value}
     leaves: dict[str, Any] = {}
@@ -158,15 +158,15 @@ def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _schema_fields(api: Api, response_format: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields by which an API gets a JSON schema."""
-    given = response_format["json_schema"]
+    """Return the fields by which an API gets a JSON schema."""
+    schema = response_format["json_schema"]
     match api:
         case "chat":
             return {"response_format": response_format}
         case "responses":
-            return {"text.format": {"type": "json_schema", **given}}
+            return {"text.format": {"type": "json_schema", **schema}}
         case "gemini":
-            config = {"responseMimeType": "application/json", "responseJsonSchema": given["schema"]}
+            config = {"responseMimeType": "application/json", "responseJsonSchema": schema["schema"]}
             return {f"generationConfig.{name}": value for name, value in config.items()}
         case "anthropic":
-            return {"output_format": {"type": "json_schema", "schema": given["schema"]}}
+            return {"output_format": {"type": "json_schema", "schema": schema["schema"]}}

@@ -72,7 +72,7 @@ def _studio() -> _Studio:
 
 
 def _frames() -> list[np.ndarray]:
-    """Frames of a square that moves over a gradient."""
+    """Return frames of a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
     frames = []
@@ -84,8 +84,8 @@ def _frames() -> list[np.ndarray]:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """One request of every form that a study sends to an entry: for a model by regime, for a judge by task (and a label
-    of confabulation, if the judge labels it)."""
+    """Return one request of every form that a study sends to an entry: for a model by regime, for a judge by task (and
+    a label of confabulation, if the judge labels it)."""
     if isinstance(entry, ModelEntry):
         return {regime: _answer_request(entry, regime) for regime in REGIMES}
     assert isinstance(entry, JudgeEntry)
@@ -136,8 +136,8 @@ def _short(value: Any) -> str:
 
 
 def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
-    """The problems of the turns: system prompt and question must arrive verbatim, with the clip before the question and
-    nothing else."""
+    """Yield the problems of the turns: system prompt and question must arrive verbatim, with the clip before the
+    question and nothing else."""
     roles = [role for role, _ in turns]
     if roles != ["system", "user"]:
         yield f"the turns are {roles}, not system and user"
@@ -155,14 +155,14 @@ def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], req
 
 
 def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
-    wanted = media.n_frames if media.profile == "images" else 1
-    if len(clips) != wanted:
-        yield f"media: {len(clips)} of {wanted} {'images' if media.profile == 'images' else 'videos'} arrive"
+    expected = media.n_frames if media.profile == "images" else 1
+    if len(clips) != expected:
+        yield f"media: {len(clips)} of {expected} {'images' if media.profile == 'images' else 'videos'} arrive"
         return
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for clip in clips:
-        found.update(clip.data)
-    if found.hexdigest() != media.sha256:
+        hasher.update(clip.data)
+    if hasher.hexdigest() != media.sha256:
         yield "media: the bytes that arrive are not those that were prepared"
     for name, seen, declared in (
         ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
@@ -192,7 +192,7 @@ def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[s
 
 
 def model_name(entry: Entry) -> str:
-    """The provider's own name of a model: litellm's name without the route."""
+    """Return the provider's own name of a model: litellm's name without the route."""
     return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
 
 
@@ -222,8 +222,8 @@ def _examine_network(entry: Entry) -> Checked:
     bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
     for form, body in bodies.items():
-        found = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
-        for problem in found:
+        wrong = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
+        for problem in wrong:
             problems.setdefault(problem, []).append(form)
     listed = [p if len(forms) == len(bodies) else f"{' and '.join(forms)}: {p}" for p, forms in problems.items()]
     if isinstance(entry, ModelEntry):
@@ -233,24 +233,24 @@ def _examine_network(entry: Entry) -> Checked:
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
-    """Departures from the protocol, which holds for every model in addition to its entry."""
+    """Yield departures from the protocol, which holds for every model in addition to its entry."""
     for regime, request in requests.items():
         if ("response_format" in request.params) != (entry.json_schema and regime == "json"):
             yield f"{regime}: structured output is for the JSON regime alone, where the entry has json_schema"
-    shown = {request.sent.n_frames for request in requests.values() if request.sent}
-    if "media" not in entry.waivers and shown != {_PROTOCOL_FRAMES}:
-        yield f"media: {shown} frames of a 5 s clip are sent, the protocol has {_PROTOCOL_FRAMES} (5 a second)"
+    frame_counts = {request.sent.n_frames for request in requests.values() if request.sent}
+    if "media" not in entry.waivers and frame_counts != {_PROTOCOL_FRAMES}:
+        yield f"media: {frame_counts} frames of a 5 s clip are sent, the protocol has {_PROTOCOL_FRAMES} (5 a second)"
 
 
 def _line(entry: Entry, wire: WireBody | str, media: Media | None) -> str:
     if isinstance(wire, str):
         return f"{entry.id:<24} nothing caught"
-    shown = f"{media.profile} {media.n_frames} frames {media.size_bytes:,} bytes" if media else "no clip"
+    clip = f"{media.profile} {media.n_frames} frames {media.size_bytes:,} bytes" if media else "no clip"
     try:
         fields = read_body(wire).fields
     except UNKNOWN_FORM:
         fields = {}
-    return f"{entry.id:<24} {wire.path}  {shown}  {_fields(fields)}"
+    return f"{entry.id:<24} {wire.path}  {clip}  {_fields(fields)}"
 
 
 def _fields(fields: Mapping[str, Any]) -> str:
@@ -260,31 +260,31 @@ def _fields(fields: Mapping[str, Any]) -> str:
 
 def _examine_local(entry: ModelEntry, spec: MediaSpec) -> Checked:
     """Check the frames that a local model is shown: nothing is sent, but frames are picked and resized."""
-    shown = sample(_studio().clip, spec)
-    count, (height, width) = len(shown.frames), shown.frames.shape[1:3]
-    times = " ".join(f"{time:g}" for time in shown.times_s[:3])
-    line = f"{entry.id:<24} local  {count} frames of {width} x {height} at {times} ... {shown.times_s[-1]:g} s"
-    problems = list(_local_problems(shown.times_s, (width, height), spec))
+    frames = sample(_studio().clip, spec)
+    count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
+    times = " ".join(f"{time:g}" for time in frames.times_s[:3])
+    line = f"{entry.id:<24} local  {count} frames of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
+    problems = list(_local_problems(frames.times_s, (width, height), spec))
     return Checked(entry, f"{line}  {_fields(flat(entry.params))}", problems)
 
 
 def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec) -> Iterator[str]:
     last = (_CLIP_FRAMES - 1) / _CLIP_FPS
     if spec.uniform is not None:
-        wanted = np.linspace(0, last, min(spec.uniform, _CLIP_FRAMES))
+        expected = np.linspace(0, last, min(spec.uniform, _CLIP_FRAMES))
     else:
-        wanted = (np.arange(_CLIP_FRAMES) / (spec.fps or 1))[: spec.most]
-        wanted = wanted[wanted <= last + 1e-6]
-    if len(times_s) != len(wanted):
-        yield f"media: {len(times_s)} frames are shown, {len(wanted)} are declared"
-    elif np.abs(times_s - wanted).max() > 0.5 / _CLIP_FPS + 1e-6:
+        expected = (np.arange(_CLIP_FRAMES) / (spec.fps or 1))[: spec.most]
+        expected = expected[expected <= last + 1e-6]
+    if len(times_s) != len(expected):
+        yield f"media: {len(times_s)} frames are shown, {len(expected)} are declared"
+    elif np.abs(times_s - expected).max() > 0.5 / _CLIP_FPS + 1e-6:
         yield "media: the frames are not those nearest to the declared times"
     if size != (spec.size or _CLIP_SIZE):
         yield f"media: frames are {size}, {spec.size or _CLIP_SIZE} is declared"
 
 
 def participants() -> dict[str, Entry]:
-    """Models and judges that are asked over the network or locally, by id."""
+    """Return models and judges that are asked over the network or locally, by id."""
     return {**load_models(), **load_judges()}
 
 

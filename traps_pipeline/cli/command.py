@@ -35,7 +35,7 @@ Run = Callable[[argparse.Namespace], int]  # a command: it takes its parsed argu
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:
-    """The type of an argument that is a whole number in these bounds, in plain digits."""
+    """Return the type of an argument that is a whole number in these bounds, in plain digits."""
 
     def parse(text: str) -> int:
         if not re.fullmatch(r"-?[0-9]{1,18}", text) or not least <= int(text) <= most:
@@ -46,7 +46,7 @@ def whole(least: int, most: int) -> Callable[[str], int]:
 
 
 def number(above: float, most: float) -> Callable[[str], float]:
-    """The type of an argument that is a number in these bounds (the lower one left out), in plain digits."""
+    """Return the type of an argument that is a number in these bounds (the lower one left out), in plain digits."""
 
     def parse(text: str) -> float:
         if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,9})?", text) or not above < float(text) <= most:
@@ -193,8 +193,8 @@ def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) 
 def listening_of(
     arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
 ) -> Listening:
-    """Where such a command listens and whom it lets in: who has the token, or each person with a token of their own.
-    danger: what everybody who reaches the address could do. Raises TrapsError."""
+    """Return where such a command listens and whom it lets in: who has the token, or each person with a token of their
+    own. danger: what everybody who reaches the address could do. Raises TrapsError."""
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
     from traps_pipeline.servers.server import Listening
@@ -208,7 +208,9 @@ def listening_of(
 
 
 def place_of(arguments: argparse.Namespace) -> Place:
-    """Where the study lies that a command works in; it may not exist yet. Raises TrapsError for a wrong address."""
+    """Return where the study lies that a command works in; it may not exist yet. Raises TrapsError for a wrong
+    address.
+    """
     from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -216,15 +218,15 @@ def place_of(arguments: argparse.Namespace) -> Place:
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:
-    """The study that a command works in. Raises TrapsError naming the remedy if there is none."""
+    """Return the study that a command works in. Raises TrapsError naming the remedy if there is none."""
     from traps_pipeline.storage.workspace import Workspace
 
     return entered(Workspace.open(place_of(arguments)))
 
 
 def entered(workspace: Workspace) -> Workspace:
-    """The workspace, after it was set in the environment, so that the partition keys here and in child processes are
-    those of its study."""
+    """Return the workspace, after it was set in the environment, so that the partition keys here and in child processes
+    are those of its study."""
     from traps_pipeline.models.own import forget
     from traps_pipeline.storage.workspace import VARIABLE
 
@@ -256,7 +258,7 @@ def add_panel(parser: argparse.ArgumentParser) -> None:
 
 
 def experiment_of(arguments: argparse.Namespace) -> Experiment:
-    """The experiment that a command names. Raises TrapsError with the known names."""
+    """Return the experiment that a command names. Raises TrapsError with the known names."""
     from traps_pipeline.pipeline.experiment import load_experiment
 
     return load_experiment(arguments.experiment)

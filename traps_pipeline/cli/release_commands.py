@@ -96,7 +96,7 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def _date(text: str | None) -> str | None:
-    """A date as it was given. Raises TrapsError if it is none."""
+    """Return a date as it was given. Raises TrapsError if it is none."""
     from datetime import date
 
     try:
@@ -184,7 +184,7 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
 def _not_drawn(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
-    """What the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
+    """Return what the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
     from traps_pipeline.release.commitment import other_arithmetic, same_scene
 
     if problems and specs is not None and {*specs} == {*drawn} and all(same_scene(specs[i], drawn[i]) for i in specs):

@@ -78,7 +78,7 @@ def compare_studies(arguments: argparse.Namespace) -> int:
 
 
 def _cell(value: object) -> str:
-    """A figure with four digits, a dash for one that is missing."""
+    """Return a figure with four digits, a dash for one that is missing."""
     if not isinstance(value, float):
         return str(value)
     return "-" if value != value else f"{value:.4f}"

@@ -186,8 +186,8 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """The workspace, with the budgets of the experiment in its study; budgets on the command line replace them. Raises
-    TrapsError for a wrong amount or name."""
+    """Return the workspace, with the budgets of the experiment in its study; budgets on the command line replace them.
+    Raises TrapsError for a wrong amount or name."""
     stated = {name: getattr(experiment, name) for name in MONEY}
     money: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
     if arguments.allow_unknown_prices:
@@ -210,7 +210,7 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
 
 
 def _check_participant(name: str) -> None:
-    """Raises TrapsError with the known names if no model or judge has this name."""
+    """Raise TrapsError with the known names if no model or judge has this name."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import get_model
 

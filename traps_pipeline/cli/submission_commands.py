@@ -58,7 +58,7 @@ def results(arguments: argparse.Namespace) -> int:
 
 
 def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
-    """What `traps publish verify` says of a submission."""
+    """Return what `traps publish verify` says of a submission."""
     from traps_pipeline.release.submission import read_submission
     from traps_pipeline.release.verification import verify
 

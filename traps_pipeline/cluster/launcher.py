@@ -64,10 +64,10 @@ class _NodeClient(JobSubmissionClient):
     dagster-ray 0.4.8 puts the run, as JSON, between single quotes without looking whether it holds some.
     """
 
-    def submit_job(self, *, entrypoint: str, metadata: dict[str, str], **options: Any) -> str:
+    def submit_job(self, *, entrypoint: str, metadata: dict[str, str] | None = None, **options: Any) -> str:
         """Submit a job; return its id."""
         return super().submit_job(
-            entrypoint=node_command(entrypoint, metadata["dagster/run-id"]), metadata=metadata, **options
+            entrypoint=node_command(entrypoint, (metadata or {})["dagster/run-id"]), metadata=metadata, **options
         )
 
 

@@ -57,6 +57,6 @@ def _bucket(address: str) -> Bucket:
 
 @cache
 def _store(root: Path, address: str, database: Database, name: str, variable: str) -> ObjectStore:
-    """The store of a process: what it has seen is not looked at again when the workspace is opened once more."""
+    """Return the store of a process: what it has seen is not looked at again when the workspace is opened once more."""
     anchor = _HEAD + yaml.safe_dump({"format": FORMAT, "name": name, "database": variable}, sort_keys=False)
     return ObjectStore(root, _bucket(address), database, name, anchor.encode())

@@ -50,9 +50,9 @@ def require_same_code(submitted: str, study: str) -> None:
     """
     if not submitted:
         return
-    here, there = json.loads(code_here()), json.loads(submitted)
-    if differences := [name for name in sorted(here.keys() & there.keys()) if here[name] != there[name]]:
-        described = ", ".join(f"{name} {here[name]} here and {there[name]} there" for name in differences)
+    here, theirs = json.loads(code_here()), json.loads(submitted)
+    if differences := [name for name in sorted(here.keys() & theirs.keys()) if here[name] != theirs[name]]:
+        described = ", ".join(f"{name} {here[name]} here and {theirs[name]} there" for name in differences)
         raise TrapsError(
             f"the host {socket.gethostname()} has other code than the host that submitted this run of the study "
             f"{study}: {described}. Install the same version of the package from the same lock on both, and run the "

@@ -87,7 +87,7 @@ class Answer(BaseModel):
         return self
 
     def as_outcome(self, entry: ModelEntry) -> Outcome:
-        """The outcome of the request, with its price from the registry."""
+        """Return the outcome of the request, with its price from the registry."""
         fields = self.model_dump(exclude={"key", "outcome", "latency_s"})
         cost = None
         if entry.prices and self.prompt_tokens is not None and self.completion_tokens is not None:
@@ -142,8 +142,8 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
 
 
 def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
-    """The experiment's cells whose datasets have items; a study of one taxonomy has two of four. Raises TrapsError if
-    there is none."""
+    """Return the experiment's cells whose datasets have items; a study of one taxonomy has two of four. Raises
+    TrapsError if there is none."""
     cells = [cell for cell in experiment.cells() if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     if not cells:
         raise TrapsError(f"{workspace.root}: no items yet; materialize scene_specs, videos and items first")
@@ -156,8 +156,8 @@ def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
         evaluation = cell.evaluation
         if evaluation not in known:
             known[evaluation] = {*workspace.answers.read(evaluation.key).settled}
-        wanted = (question.request for question in wanted_questions(workspace, cell))
-        yield from (request for request in wanted if request.key not in known[evaluation])
+        requests = (question.request for question in wanted_questions(workspace, cell))
+        yield from (request for request in requests if request.key not in known[evaluation])
 
 
 def _line(request: Request, out: Path) -> dict[str, Any]:
@@ -212,34 +212,34 @@ def import_answers(
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
     requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
-    wanted = {request.key: request for request in requests}
+    requested = {request.key: request for request in requests}
     if path.suffix != LOG and is_batch(path):
-        return _import_batch(workspace, workspace.answers, load_models(), wanted, path)
+        return _import_batch(workspace, workspace.answers, load_models(), requested, path)
     reader = reader_of(path)
     answers, n_failed = (
-        (checked_answers(path, wanted), 0) if reader is None else _by_item(reader(path), wanted, whose or Whose())
+        (checked_answers(path, requested), 0) if reader is None else _by_item(reader(path), requested, whose or Whose())
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
     if like_errors and errors is None:
-        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, wanted))
+        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requested))
     for key in like_errors if errors == "drop" else ():
         del answers[key]
-    found = [
-        _Stored(wanted[key], answer.as_outcome(get_model(wanted[key].participant)), answer.latency_s)
+    stored = [
+        _Stored(requested[key], answer.as_outcome(get_model(requested[key].participant)), answer.latency_s)
         for key, answer in answers.items()
     ]
-    new = asyncio.run(_store(workspace, workspace.answers, found))
+    new = asyncio.run(_store(workspace, workspace.answers, stored))
     failed = f"{n_failed} samples of the log" if n_failed else ""
     return Imported(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
-def _said_of_errors(path: Path, answers: Mapping[str, Answer], wanted: Mapping[str, Request]) -> str:
+def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
     """Return how many texts look like error messages, some of them, and what to do."""
-    shown = [f"{wanted[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
+    examples = [f"{requested[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
     return (
-        f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(shown)}): say "
+        f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
         "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
     )
 
@@ -273,8 +273,8 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
 def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
     """Import a batch of votes into their ledger; `traps run` then makes tables from them. Raises TrapsError as
     `import_answers` does."""
-    wanted = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
-    return _import_batch(workspace, workspace.votes, load_judges(), wanted, path)
+    requested = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
+    return _import_batch(workspace, workspace.votes, load_judges(), requested, path)
 
 
 def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tuple[Cell, Request]]:
@@ -294,22 +294,23 @@ def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
 
 
 def _import_batch(
-    workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], wanted: Mapping[str, Request], path: Path
+    workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], requested: Mapping[str, Request], path: Path
 ) -> Imported:
-    returned = read_batch(path, wanted)
+    returned = read_batch(path, requested)
     if not returned:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
-    found = [
+    stored = [
         _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
-        for request, outcome in outcomes_of(entries, wanted, returned)
+        for request, outcome in outcomes_of(entries, requested, returned)
     ]
-    new = asyncio.run(_store(workspace, ledger, found))
-    failed = sum(one.outcome.kind in ("error", "malformed") for one in found)
-    return Imported(new, len(found) - new - failed, failures([one.outcome for one in found]))
+    new = asyncio.run(_store(workspace, ledger, stored))
+    failed = sum(one.outcome.kind in ("error", "malformed") for one in stored)
+    return Imported(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
 
 
-def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
-    """The answers of a file by key. Raises TrapsError naming the lines (up to five) that are wrong or not wanted."""
+def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
+    """Return the answers of a file by key. Raises TrapsError naming the lines (up to five) that are wrong or not
+    wanted."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):
@@ -321,7 +322,7 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
         except (ValueError, RecursionError) as error:
             wrong.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
             continue
-        if answer.key not in wanted:
+        if answer.key not in requested:
             wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
         elif answers.setdefault(answer.key, answer) != answer:
             wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
@@ -331,24 +332,26 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
     return answers
 
 
-def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose) -> tuple[dict[str, Answer], int]:
+def _by_item(
+    imported: Iterable[Given], requested: Mapping[str, Request], whose: Whose
+) -> tuple[dict[str, Answer], int]:
     """Return the answers of a harness by key, and the number of calls that failed in it and have no answer elsewhere.
 
     Epochs of a harness are runs from `whose.run` on. Raises TrapsError naming those (up to five) that are wrong or not
     wanted.
     """
-    models = sorted({request.participant for request in wanted.values()})
+    models = sorted({request.participant for request in requested.values()})
     model = whose.model or (models[0] if len(models) == 1 else None)
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
         (str(at["item_id"]), str(at["regime"]), int(at["run"])): key
-        for key, request in wanted.items()
+        for key, request in requested.items()
         if (at := request.about)["model"] == model
     }
     names = {opaque(whose.key, item): item for item, _, _ in keys} if whose.key else {}
     answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
-    for one in given:
+    for one in imported:
         run = whose.run + one.epoch - 1 if one.run is None else one.run
         key = keys.get((names.get(one.item, one.item), one.regime, run))
         try:
@@ -368,11 +371,11 @@ def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose
     return answers, len(failed - answers.keys())
 
 
-async def _store(workspace: Workspace, ledger: Ledger, found: Sequence[_Stored]) -> int:
+async def _store(workspace: Workspace, ledger: Ledger, stored: Sequence[_Stored]) -> int:
     """Store what the ledger does not hold, all of it or nothing; the number of new answers. A failed call is stored,
     too, and is asked again."""
     rows: dict[str, list[Stored]] = {}
-    for one in sorted(found, key=lambda one: one.evaluation):
+    for one in sorted(stored, key=lambda one: one.evaluation):
         row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
         rows.setdefault(one.evaluation.key, []).append(row)
     return await ledger.store(rows, progress.current().note)

@@ -47,7 +47,7 @@ class Given:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """What reads a file of answers by item; None for a file of answers by key, or of a provider's batch."""
+    """Return what reads a file of answers by item; None for a file of answers by key, or of a provider's batch."""
     if path.suffix == LOG:
         return _eval_log
     if path.suffix == ".json":
@@ -80,7 +80,7 @@ def _json_log(path: Path) -> Iterator[Given]:
 
 
 def _eval_log(path: Path) -> Iterator[Given]:
-    """A log is a zip with a JSON file a sample, compressed with deflate or zstd."""
+    """Yield a log is a zip with a JSON file a sample, compressed with deflate or zstd."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
@@ -100,7 +100,7 @@ def _eval_log(path: Path) -> Iterator[Given]:
 
 
 def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
-    """An entry in zstd, which this Python's zipfile does not know. Raises ValueError."""
+    """Return an entry in zstd, which this Python's zipfile does not know. Raises ValueError."""
     import pyarrow as pa
 
     raw.seek(entry.header_offset)
@@ -147,10 +147,14 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
     inspect_ai's providers count cached input and reasoning within `input_tokens` and `output_tokens` or beside them;
     the total tells which.
     """
-    told = {name: value for name, value in usage.items() if type(value) is int}
-    cached = told.get("input_tokens_cache_read", 0) + told.get("input_tokens_cache_write", 0)
-    counts: dict[str, Any] = {n: told[n] for n in ("input_tokens", "output_tokens", "total_tokens") if n in told}
-    if told.get("input_tokens", 0) + cached + told.get("output_tokens", 0) <= told.get("total_tokens", 0):
+    token_counts = {name: value for name, value in usage.items() if type(value) is int}
+    cached = token_counts.get("input_tokens_cache_read", 0) + token_counts.get("input_tokens_cache_write", 0)
+    counts: dict[str, Any] = {
+        n: token_counts[n] for n in ("input_tokens", "output_tokens", "total_tokens") if n in token_counts
+    }
+    if token_counts.get("input_tokens", 0) + cached + token_counts.get("output_tokens", 0) <= token_counts.get(
+        "total_tokens", 0
+    ):
         counts["cache_read_input_tokens"] = cached
     counts["output_tokens_details"] = {"reasoning_tokens": usage.get("reasoning_tokens")}
     read = read_usage(counts, Sizes(0, 0, 0))
@@ -179,7 +183,7 @@ def _lmms_samples(path: Path) -> Iterator[Given]:
 
 
 def _own_lines(path: Path) -> Iterator[Given]:
-    """Lines with item, regime, text, and run where there are several."""
+    """Yield lines with item, regime, text, and run where there are several."""
     for number, line in read_lines(path):
         try:
             row = json.loads(line)
@@ -193,7 +197,7 @@ def _own_lines(path: Path) -> Iterator[Given]:
 
 
 def _answer(outcome: str, text: str | None) -> dict[str, Any]:
-    """Outcome and text as the ledger has them: no text without an outcome that has one."""
+    """Return outcome and text as the ledger has them: no text without an outcome that has one."""
     if outcome in (*WITH_TEXT, UNFINISHED) and not (text or "").strip():
         outcome = "empty"
     return {"outcome": outcome, "text": text if outcome in (*WITH_TEXT, UNFINISHED) else None}

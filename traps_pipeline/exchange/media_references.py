@@ -29,7 +29,7 @@ class References:
     address: str
 
     def of(self, kind: str, data: str) -> str:
-        """The address of a medium, given as base64; its file is written once."""
+        """Return the address of a medium, given as base64; its file is written once."""
         content = base64.b64decode(data, validate=True)
         name = hashlib.sha256(content).hexdigest()[:32] + SUFFIX.get(kind, "")
         if not (self.folder / name).exists():
@@ -38,8 +38,8 @@ class References:
         return f"{self.address.rstrip('/')}/{name}"
 
     def instead_of(self, value: Any) -> Any:
-        """A body with an address for each inline medium, in the form of its API: OpenAI's data URIs, Gemini's inline
-        data, and Anthropic's sources. Everything else stays as it is."""
+        """Return a body with an address for each inline medium, in the form of its API: OpenAI's data URIs, Gemini's
+        inline data, and Anthropic's sources. Everything else stays as it is."""
         match value:
             case str() if value.startswith(_DATA) and _BASE64 in value[:64]:
                 kind, _, data = value.removeprefix(_DATA).partition(_BASE64)

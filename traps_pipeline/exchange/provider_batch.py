@@ -43,7 +43,7 @@ Item = TypeVar("Item")
 
 
 def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
-    """The items in lists of at most AT_ONCE."""
+    """Yield the items in lists of at most AT_ONCE."""
     rest = iter(items)
     while some := list(islice(rest, AT_ONCE)):
         yield some
@@ -86,7 +86,7 @@ def export_batches(
 
 
 def line_of(key: str, wire: WireBody, body: Mapping[str, Any]) -> dict[str, Any]:
-    """The line of a call with this body, in its provider's form."""
+    """Return the line of a call with this body, in its provider's form."""
     match wire.api:
         case "gemini":
             return {"key": key, "request": body}
@@ -151,7 +151,7 @@ class Returned:
 
 
 def is_batch(path: Path) -> bool:
-    """Whether a file is a provider's, and not one of answers in this project's form."""
+    """Return whether a file is a provider's, and not one of answers in this project's form."""
     for _, line in read_lines(path):
         try:
             parsed = json.loads(line)
@@ -162,8 +162,8 @@ def is_batch(path: Path) -> bool:
 
 
 def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]:
-    """What a file of OpenAI's, vLLM's, Gemini's or Anthropic's form returns, by key. Raises TrapsError naming lines
-    that are no answers, and keys that are not wanted or stand there twice."""
+    """Return what a file of OpenAI's, vLLM's, Gemini's or Anthropic's form returns, by key. Raises TrapsError naming
+    lines that are no answers, and keys that are not wanted or stand there twice."""
     found, wrong = dict[str, Returned](), list[str]()
     for number, line in read_lines(path):
         try:
@@ -202,14 +202,14 @@ def _returned(line: Any) -> tuple[str, Returned]:
 
 
 def _word(value: Any) -> str:
-    """The kind of a failure of a batch, which the provider names."""
+    """Return the kind of a failure of a batch, which the provider names."""
     return "batch_" + "".join(c for c in str(value).lower() if c.isalnum() or c == "_").removeprefix("batch_")[:40]
 
 
 def outcomes_of(
     entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, Returned]
 ) -> Iterator[tuple[Request, Outcome]]:
-    """Each returned call with its outcome, as the live call would have read it."""
+    """Yield each returned call with its outcome, as the live call would have read it."""
     by_name: dict[str, list[str]] = {}
     for key in returned:
         by_name.setdefault(wanted[key].participant, []).append(key)
@@ -227,6 +227,6 @@ def outcomes_of(
 
 
 def failures(outcomes: Sequence[Outcome]) -> str:
-    """The numbers of failed calls by kind, in words; empty if none failed."""
+    """Return the numbers of failed calls by kind, in words; empty if none failed."""
     kinds = Counter(outcome.error for outcome in outcomes if outcome.kind in ("error", "malformed"))
     return ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=str))

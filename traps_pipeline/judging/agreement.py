@@ -19,7 +19,8 @@ from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Rati
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """AGREEMENT rows from VOTES rows: per dataset and task, one for the panel and one for every two of its judges."""
+    """Return AGREEMENT rows from VOTES rows: per dataset and task, one for the panel and one for every two of its
+    judges."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         rows.append(about | _panel_row(group.values))
@@ -30,7 +31,8 @@ def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.Da
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """JUDGE_BIAS rows from VOTES rows: each judge's rate of yes against that of the majority on the same answers."""
+    """Return JUDGE_BIAS rows from VOTES rows: each judge's rate of yes against that of the majority on the same
+    answers."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         verdict = majority(group.values)
@@ -40,12 +42,12 @@ def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.D
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_BIAS.names))
 
 
-def _groups(whole: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:
-    """The ratings of each dataset and task that has votes, with the columns that all of its rows share."""
+def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:
+    """Yield the ratings of each dataset and task that has votes, with the columns that all of its rows share."""
     for dataset in DATASETS:
         for task in TASKS:
-            chosen = (whole.answers["dataset"] == dataset) & (whole.answers["task"] == task)
-            group = whole.select(chosen.to_numpy(bool))
+            chosen = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
+            group = ratings_of_study.select(chosen.to_numpy(bool))
             if len(group.values):
                 versions = {name: _joined(group.answers[name].unique(), by) for name, by in _JOINS.items()}
                 yield {"dataset": dataset, "task": task, **versions}, group
@@ -62,12 +64,12 @@ def _joined(values: Iterable[str], by: str) -> str:
 
 
 def complete(values: np.ndarray) -> np.ndarray:
-    """The rows on which every judge cast a valid vote."""
+    """Return the rows on which every judge cast a valid vote."""
     return values[(values != INVALID).all(axis=1)]
 
 
 def fleiss_kappa(values: np.ndarray) -> float:
-    """Fleiss' kappa of complete rows, (answers, judges) of YES and NO; NaN where there is one class or no row.
+    """Return Fleiss' kappa of complete rows, (answers, judges) of YES and NO; NaN where there is one class or no row.
 
     An answer with y yes of k votes agrees by (y (y-1) + (k-y) (k-y-1)) / (k (k-1)); chance by p^2 + (1-p)^2, p being
     the share of yes in all votes. NaN also for a single judge.
@@ -82,7 +84,8 @@ def fleiss_kappa(values: np.ndarray) -> float:
 
 
 def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
-    """Cohen's kappa of two judges' votes of YES and NO on the same answers; NaN where there is one class or no vote."""
+    """Return Cohen's kappa of two judges' votes of YES and NO on the same answers; NaN where there is one class or no
+    vote."""
     yes = int((one == YES).sum()), int((other == YES).sum())
     n = len(one)
     if sum(yes) in (0, 2 * n):
@@ -92,8 +95,8 @@ def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def krippendorff_alpha(values: np.ndarray) -> float:
-    """Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing. NaN where the answers that have
-    two valid votes or more hold one class or none.
+    """Return Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing. NaN where the answers that
+    have two valid votes or more hold one class or none.
 
     In an answer with y yes of m valid votes, 2 y (m-y) of its m (m-1) ordered pairs disagree, with weight 1 / (m-1)
     each; by chance, 2 n_yes n_no of the n (n-1) ordered pairs of all n pairable votes would disagree.
@@ -109,8 +112,8 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 
 def unanimous_share(values: np.ndarray) -> float:
-    """Share of complete rows, (answers, judges), on which all votes are the same; NaN where there is no row, or a
-    single judge."""
+    """Return share of complete rows, (answers, judges), on which all votes are the same; NaN where there is no row, or
+    a single judge."""
     several = len(values) and values.shape[1] > 1
     return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
 
@@ -126,44 +129,44 @@ def _beyond_chance(observed: float, by_chance: float) -> float:
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def _shared(values: np.ndarray, whole: np.ndarray) -> dict[str, Any]:
-    """The columns that the panel's row and a pair's row share."""
+def _shared(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
+    """Return the columns that the panel's row and a pair's row share."""
     valid = values != INVALID
     return {
         "n_items": len(values),
-        "n_complete": len(whole),
+        "n_complete": len(complete_rows),
         "invalid": float(1 - valid.mean()),
         "prevalence": _share((values == YES).sum(), valid.sum()),
-        "agreement": unanimous_share(whole),
+        "agreement": unanimous_share(complete_rows),
         "alpha": krippendorff_alpha(values),
-        "undefined": _why_undefined(whole),
+        "undefined": _why_undefined(complete_rows),
     }
 
 
 def _panel_row(values: np.ndarray) -> dict[str, Any]:
-    whole = complete(values)
+    complete_rows = complete(values)
     undecided = int((majority(values) == INVALID).sum())
-    return _shared(values, whole) | {
+    return _shared(values, complete_rows) | {
         "judges": PANEL,
         "n_undecided": undecided,
-        "fleiss_kappa": fleiss_kappa(whole),
+        "fleiss_kappa": fleiss_kappa(complete_rows),
         "cohen_kappa": np.nan,
     }
 
 
 def _pair_row(values: np.ndarray) -> dict[str, Any]:
-    whole = complete(values)
-    kappa = cohen_kappa(whole[:, 0], whole[:, 1])
-    return _shared(values, whole) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
+    complete_rows = complete(values)
+    kappa = cohen_kappa(complete_rows[:, 0], complete_rows[:, 1])
+    return _shared(values, complete_rows) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
 
 
-def _why_undefined(whole: np.ndarray) -> str | None:
-    if whole.shape[1] < 2:
+def _why_undefined(complete_rows: np.ndarray) -> str | None:
+    if complete_rows.shape[1] < 2:
         return "one judge agrees with nobody"
-    if not len(whole):
+    if not len(complete_rows):
         return "no answer has a valid vote of each judge"
-    if (whole == whole[0, 0]).all():
-        return f"every complete vote is {'yes' if whole[0, 0] == YES else 'no'}"
+    if (complete_rows == complete_rows[0, 0]).all():
+        return f"every complete vote is {'yes' if complete_rows[0, 0] == YES else 'no'}"
     return None
 
 
@@ -184,5 +187,5 @@ def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _share(part: Any, whole: Any) -> float:
-    return float(part) / float(whole) if whole else float("nan")
+def _share(part: Any, total: Any) -> float:
+    return float(part) / float(total) if total else float("nan")

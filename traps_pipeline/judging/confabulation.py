@@ -76,18 +76,18 @@ class Protocol(BaseModel):
     validation: Validation
 
     def cells(self, model: str) -> list[Cell]:
-        """The cells that a model's failures come from."""
+        """Return the cells that a model's failures come from."""
         return [Cell(dataset, Evaluation(model, self.regime, self.run)) for dataset in DATASETS]
 
     def judge(self, panel: str) -> JudgeEntry | None:
-        """The judge of a study with this panel; None where there is none."""
+        """Return the judge of a study with this panel; None where there is none."""
         name = self.judges.get(panel)
         return load_judges()[name] if name is not None else None
 
 
 @cache
 def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
-    """The protocol. Raises TrapsError naming the file and the field, model or judge that is wrong."""
+    """Return the protocol. Raises TrapsError naming the file and the field, model or judge that is wrong."""
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
     with within(path):
         runs = {model: get_model(model).runs for model in protocol.models}
@@ -106,7 +106,7 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
 
 
 def protocol_digest(panel: str) -> str:
-    """Digest of everything, besides the answers, that the labels of a study with this panel depend on."""
+    """Return digest of everything, besides the answers, that the labels of a study with this panel depend on."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
@@ -128,24 +128,27 @@ class Failure(Call):
 
 
 def void_kind(dataset: str) -> str:
-    """Why the voids of a dataset cannot be answered: a key of VOID_KINDS."""
+    """Return why the voids of a dataset cannot be answered: a key of VOID_KINDS."""
     if is_ill_posed(dataset):
         return "question"
     return "occluder" if dataset == "occlusion" else "truncation"
 
 
 def drawn(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """A seeded sample of n keys without replacement (all keys if there are fewer), independent of their order."""
+    """Return a seeded sample of n keys without replacement (all keys if there are fewer), independent of their
+    order.
+    """
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
 
 
 def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -> str:
-    """The id of a failure for its annotators: it reveals neither model nor item, and changes with the answer."""
+    """Return the id of a failure for its annotators: it reveals neither model nor item, and changes with the answer."""
     return digest([cell.key, item_id, answer, trace or None])[:12]
 
 
 def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
-    """A model's sample by cell. Empty, with a note, until every dataset of the study that has items has verdicts."""
+    """Return a model's sample by cell. Empty, with a note, until every dataset of the study that has items has
+    verdicts."""
     protocol = load_protocol()
     cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     lacking = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
@@ -153,18 +156,18 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
         if len(lacking) < len(cells):
             progress.current().note(f"confabulation: {model} is sampled only after {', '.join(lacking)} is judged")
         return {}
-    found = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
+    failures = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
     sample: dict[Cell, list[Failure]] = {}
-    for key in drawn(protocol.seed, protocol.n, found):
-        cell, row = found[key]
+    for key in drawn(protocol.seed, protocol.n, failures):
+        cell, row = failures[key]
         trace = row["reasoning"] if protocol.models[model] == TRACE_AND_OUTPUT else None
         request = label_request(judge, cell, row, row["text"], trace)
-        sample.setdefault(cell, []).append(Failure(request, row, row["text"], trace, len(found)))
+        sample.setdefault(cell, []).append(Failure(request, row, row["text"], trace, len(failures)))
     return sample
 
 
 def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
-    """The void items whose answers the panel judged as not abstained, with text and trace of each answer."""
+    """Return the void items whose answers the panel judged as not abstained, with text and trace of each answer."""
     verdicts = workspace.tables.read(VERDICTS, cell.partition, ["item_id", "side", "abstained"])
     failed = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].eq(False), ["item_id"]]
     responses = workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"])
@@ -179,14 +182,14 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 
 
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
-    """The user message to the judge."""
-    shown = [quoted("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
+    """Return the user message to the judge."""
+    parts = [quoted("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
     about = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
-    return "\n\n".join([*about, *shown, quoted("response", "RESPONSE", answer)])
+    return "\n\n".join([*about, *parts, quoted("response", "RESPONSE", answer)])
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
-    """The call to the judge about one failure; it reveals neither model nor regime nor ground truth."""
+    """Return the call to the judge about one failure; it reveals neither model nor regime nor ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
     return judge_request(judge, prompt(f"judge_{TASK}"), SCHEMA, about_answer(TASK, cell, item["item_id"]), user)
 
@@ -206,8 +209,8 @@ class Labels(BaseModel):
 
 
 def collect_labels(workspace: Workspace) -> StageOutput:
-    """CONFABULATION rows of a study: sample every model of the protocol whose answers are judged, and ask the judge for
-    the labels that the ledger of votes does not hold.
+    """Return CONFABULATION rows of a study: sample every model of the protocol whose answers are judged, and ask the
+    judge for the labels that the ledger of votes does not hold.
 
     There are no rows if the study's panel has no judge for confabulation.
     """
@@ -222,9 +225,9 @@ def collect_labels(workspace: Workspace) -> StageOutput:
     def finish(settled: Settled[Cell, Failure]) -> tuple[Cell, StageOutput]:
         return settled.made(_label_row)
 
-    for _, made in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
-        table.extend(made.rows(CONFABULATION))
-        total.add(made.tally)
+    for _, output in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
+        table.extend(output.rows(CONFABULATION))
+        total.add(output.tally)
     return StageOutput(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
 
 

@@ -21,10 +21,11 @@ _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.
 
 
 def normalise(text: str) -> str:
-    """The text in lower case with single spaces, without articles and punctuation except that of numbers and ranges."""
+    """Return the text in lower case with single spaces, without articles and punctuation except that of numbers and
+    ranges."""
     text = _THOUSANDS.sub("", re.sub("[–—−]", "-", text.lower()))
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
-    text = _PUNCTUATION.sub(lambda found: " " if found[1] else found[0], text)
+    text = _PUNCTUATION.sub(lambda match: " " if match[1] else match[0], text)
     return " ".join(word for word in text.split() if word not in ("a", "an", "the"))
 
 
@@ -66,14 +67,14 @@ def read_flag(value: object) -> object:
 
 
 def to_number(text: str) -> float | None:
-    """The number that a value contains, in digits or as a word; None if it contains none or several."""
+    """Return the number that a value contains, in digits or as a word; None if it contains none or several."""
     words = [NUMBER_WORDS.get(word, word) for word in normalise(text).split()]
     numbers = _NUMBER.findall(" ".join(words))
     return float(numbers[0]) if len(numbers) == 1 else None
 
 
 def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> str | None:
-    """The label that a value names, exactly or through an alias; None if it names none."""
+    """Return the label that a value names, exactly or through an alias; None if it names none."""
     table = {normalise(label): label for label in labels}
     table |= {normalise(alias): label for alias, label in aliases.items()}
     return table.get(normalise(text))
@@ -82,8 +83,8 @@ def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> st
 def is_correct(
     extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
 ) -> bool:
-    """Whether a value is correct: a number within 0.5 of the ground truth, or a name or alias of the true label. A
-    value that maps to no label is wrong."""
+    """Return whether a value is correct: a number within 0.5 of the ground truth, or a name or alias of the true label.
+    A value that maps to no label is wrong."""
     if extracted is None:
         return False
     if answer_type == "numeric":

@@ -44,7 +44,7 @@ class PlainAnswer(BaseModel):
     correct: bool
 
     def expected(self, task: Task) -> bool:
-        """The right vote."""
+        """Return the right vote."""
         return self.abstained if task == "abstention" else self.correct
 
 
@@ -82,12 +82,12 @@ class Attacks(BaseModel):
         return self
 
     def texts(self) -> dict[str, str]:
-        """Every text that is put to a judge, by id: the plain answers and the attacks on them."""
+        """Return every text that is put to a judge, by id: the plain answers and the attacks on them."""
         plain = {name: answer.text for name, answer in self.answers.items()}
         return plain | {a.id: a.text.replace(_PLACE, plain[a.answer]) for a in self.attacks}
 
     def item(self, name: str) -> dict[str, Any]:
-        """The item that a text answers, in the form that a judge's request needs."""
+        """Return the item that a text answers, in the form that a judge's request needs."""
         return {
             "item_id": name,
             "question": self.question,
@@ -99,7 +99,7 @@ class Attacks(BaseModel):
 
 
 def load_attacks(path: Path = ATTACKS_FILE) -> Attacks:
-    """The attacks. Raises TrapsError naming file and field."""
+    """Return the attacks. Raises TrapsError naming file and field."""
     return parse_yaml_model(Attacks, read_yaml(path), path)
 
 
@@ -107,7 +107,7 @@ Votes = Mapping[tuple[str, Task, str], Vote]  # votes by text, task and judge
 
 
 def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], attacks: Attacks) -> pd.DataFrame:
-    """JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's; votes in its ledger are not asked again.
+    """Return JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's; votes in its ledger are not asked again.
 
     Raises TrapsError where the votes stage would raise it, and when calls failed.
     """
@@ -134,7 +134,8 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
 
 
 def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes) -> pd.DataFrame:
-    """JUDGE_ROBUSTNESS rows from the votes on every text: per attack and task, one for each judge and the majority."""
+    """Return JUDGE_ROBUSTNESS rows from the votes on every text: per attack and task, one for each judge and the
+    majority."""
     rows = []
     for attack in attacks.attacks:
         for task in TASKS:
@@ -155,13 +156,13 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
 
 
 def _majority_decision(votes: Sequence[Vote]) -> bool | None:
-    """The decision of the majority of the votes; None without a majority."""
+    """Return the decision of the majority of the votes; None without a majority."""
     values = [INVALID if not vote.valid else YES if vote.decision else NO for vote in votes]
     return {YES: True, NO: False, INVALID: None}[int(majority(np.array([values], np.int8))[0])]
 
 
 def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
-    """One of RESULTS: what an attack did to a vote."""
+    """Return one of RESULTS: what an attack did to a vote."""
     if vote is expected:
         return "held"
     if clean is not expected:
@@ -170,7 +171,7 @@ def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """The text for a person: results by judge, then every vote that an attack changed."""
+    """Return the text for a person: results by judge, then every vote that an attack changed."""
     counts = []
     for judge, of_judge in rows.groupby("judge", sort=False):
         counts.append([judge, len(of_judge), *(of_judge["result"].tolist().count(name) for name in RESULTS)])

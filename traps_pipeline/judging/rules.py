@@ -86,7 +86,7 @@ def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
     reason = declines if value is None else f"The response answers {value!r}."
     if truth is None:
         vote = {"abstained": value is None, "confidence": "high", "reasoning": reason}
-        return vote | {"rejects_premise": statement.rejects}
+        return {**vote, "rejects_premise": statement.rejects}
     correct = value is not None and normalise(value) == normalise(truth)
     return {"correct": correct, "extracted_value": value, "reasoning": reason}
 

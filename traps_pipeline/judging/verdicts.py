@@ -37,8 +37,8 @@ RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 def current(
     workspace: Workspace, table: Table, columns: Sequence[str] | None = None, dataset: str | Sequence[str] = DATASETS
 ) -> pd.DataFrame:
-    """The rows of a table whose items are still in the benchmark. Every count uses these: a cell that was evaluated
-    before a correction may hold others.
+    """Return the rows of a table whose items are still in the benchmark. Every count uses these: a cell that was
+    evaluated before a correction may hold others.
 
     dataset: the datasets to read; by default the four of the pairs, so that no arm enters a figure by mistake.
     """
@@ -48,7 +48,7 @@ def current(
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
-    """VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError where these do not fit."""
+    """Return VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError where these do not fit."""
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
     votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"])
@@ -57,9 +57,9 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named above.
-    The panel is that of the cell's votes, null where it has none. The outcome is the response's, or UNREAD where that
-    is the vote of every judge.
+    """Return VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named
+    above. The panel is that of the cell's votes, null where it has none. The outcome is the response's, or UNREAD where
+    that is the vote of every judge.
 
     A response without a text is not judged, so its decisions are null. Two valid votes that agree decide; 1-1 with an
     invalid vote, or fewer valid votes, is undecided. Raises TrapsError for a response to an item that is no longer in
@@ -106,7 +106,7 @@ def _unanimous(values: np.ndarray) -> np.ndarray:
 
 
 def _refuse(rows: pd.DataFrame, wrong: np.ndarray, complaint: str, stage: str) -> None:
-    """Raises TrapsError naming the first wrong row's item and the cell to materialize."""
+    """Raise TrapsError naming the first wrong row's item and the cell to materialize."""
     if not wrong.any():
         return
     row = rows.iloc[int(np.argmax(wrong))]

@@ -149,10 +149,10 @@ class Ledger:
             yield from self._select(query.where(ROWS.c.key.in_(some)))
 
     def _parsed(
-        self, evaluation: str, wanted: Collection[str] | None
+        self, evaluation: str, keys: Collection[str] | None
     ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
         """Yield the place of each row, the row, and what is to be said of it."""
-        for stored in self._rows(evaluation, wanted):
+        for stored in self._rows(evaluation, keys):
             if not _is_whole(stored):
                 yield self._place(stored), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
                 continue
@@ -234,7 +234,7 @@ class _Content:
 
     @classmethod
     def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
-        """Raises ValueError for a row that JSON cannot hold."""
+        """Raise ValueError for a row that JSON cannot hold."""
         asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
         return cls(row, encoded(row), asides)
 
@@ -297,7 +297,7 @@ class Writer:
         batch.cover(participant, paid_by)
 
     def check(self, batch: Batch) -> None:
-        """Raises TrapsError where another process writes this evaluation now."""
+        """Raise TrapsError where another process writes this evaluation now."""
         if not batch.is_writer(self._evaluation):
             raise TrapsError(
                 f"{self._database.place}: another process has begun to ask the same calls, since this one was away; "

@@ -53,9 +53,9 @@ class Money:
 
         def change(batch: Batch) -> str | Full:
             for slot in slots:
-                taken = sum(sum(_of(its, slot)) for its in (batch.spent, batch.reserved))
-                if caps[slot] - taken < usd - CENT:
-                    return Full(slot, taken, _others(batch))
+                committed = sum(sum(_of(its, slot)) for its in (batch.spent, batch.reserved))
+                if caps[slot] - committed < usd - CENT:
+                    return Full(slot, committed, _others(batch))
             batch.reserve(reservation, participant, usd)
             return reservation
 

@@ -268,7 +268,7 @@ class PostgresDatabase(Database):
         )
 
     def _compare_clocks(self, connection: sa.Connection) -> None:
-        """Raises TrapsError where this host's clock and the database's are too far apart."""
+        """Raise TrapsError where this host's clock and the database's are too far apart."""
         before = time.time()
         theirs = self.now_s(connection)
         apart = max(theirs - time.time(), before - theirs)

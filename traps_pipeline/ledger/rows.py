@@ -23,12 +23,12 @@ MOST_USD = 10_000.0  # of one call with all its attempts
 
 
 def is_cost(value: Any) -> bool:
-    """Whether a call can have cost that much."""
+    """Return whether a call can have cost that much."""
     return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MOST_USD
 
 
 def is_seconds(value: Any) -> bool:
-    """Whether a call can have taken so long."""
+    """Return whether a call can have taken so long."""
     return type(value) in (int, float) and 0 <= value < math.inf
 
 
@@ -43,7 +43,7 @@ def _is_text(value: Any) -> bool:
 
 
 def is_count(value: Any) -> bool:
-    """Whether a call can have taken so many tokens."""
+    """Return whether a call can have taken so many tokens."""
     return type(value) is int and 0 <= value <= MOST_TOKENS
 
 

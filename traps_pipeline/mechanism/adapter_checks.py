@@ -61,7 +61,7 @@ class Subject:
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:
-        """Steering by the random direction, at so many times the length of the state there."""
+        """Return steering by the random direction, at so many times the length of the state there."""
         length = float(np.linalg.norm(self.model.forward_states(self.prompts[0]).raw[self.layer]))
         return Steering(self.direction, self.layer, tuple(alpha * length for alpha in alphas))
 
@@ -77,23 +77,23 @@ class Check:
     exact: bool = True
 
     def found(self, subject: Subject) -> str:
-        """What was found of a model. Raises TrapsError where the promise does not hold."""
+        """Return what was found of a model. Raises TrapsError where the promise does not hold."""
         dtype = subject.model.params.dtype
         if self.exact and (dtype not in EXACT or subject.model.params.quantisation != "none"):
             return f"not looked at: in {dtype} rounding differs with the shape of a pass"
         return self.run(subject)
 
 
-def _require(holds: bool, said: str) -> None:
+def _require(holds: bool, message: str) -> None:
     if not holds:
-        raise TrapsError(f"{said}; install the pinned versions, or do not look into this model")
+        raise TrapsError(f"{message}; install the pinned versions, or do not look into this model")
 
 
 # --- states -----------------------------------------------------------------------------------------------------------
 
 
 def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
-    """The library's own states of a prompt, (T, d) each: embeddings, outputs of blocks, the last one normed."""
+    """Return the library's own states of a prompt, (T, d) each: embeddings, outputs of blocks, the last one normed."""
     import torch
 
     model = subject.model
@@ -144,15 +144,15 @@ def _zero(subject: Subject) -> str:
 
 def _parts(subject: Subject) -> str:
     prompt, question = subject.prompts[1], QUESTIONS[1]
-    found, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
+    parts, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
     ids = prompt.inputs["input_ids"][0]
     for name, text in (("system", SYSTEM), ("question", question)):
-        there = "".join(decode(ids[found[name]]).split())
-        _require(there == "".join(text.split()), f"the tokens of the {name} read {there[:80]!r}")
-    _require(bool(found["visual"].any()), "no visual token is found")
-    stamps = int(found["stamps"].sum())
+        decoded = "".join(decode(ids[parts[name]]).split())
+        _require(decoded == "".join(text.split()), f"the tokens of the {name} read {decoded[:80]!r}")
+    _require(bool(parts["visual"].any()), "no visual token is found")
+    stamps = int(parts["stamps"].sum())
     times = f"{stamps} of time stamps" if stamps else "it writes no times"
-    return f"{int(found['visual'].sum())} visual tokens, {times}"
+    return f"{int(parts['visual'].sum())} visual tokens, {times}"
 
 
 def _pooled(subject: Subject) -> str:
@@ -176,9 +176,9 @@ def _patching(subject: Subject) -> str:
     tokens = abstention_tokens(model)
     other = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
     target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other))
-    whole = np.ones(target.length, bool)
-    everywhere = [Patch("residual", layer, whole) for layer in range(model.n_layers + 1)]
-    sites = [Patch(site, layer, whole) for site in SITES for layer in range(1, model.n_layers + 1)]
+    all_tokens = np.ones(target.length, bool)
+    everywhere = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
+    sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
     same = patched_changes(model, target, target, [*everywhere, *sites], tokens)
     _require(bool((same == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
@@ -238,10 +238,10 @@ CHECKS = (
 
 
 def brightening() -> tuple[np.ndarray, np.ndarray]:
-    """A clip for the questions: four frames (4, 64, 96, 3), half a second apart."""
+    """Return a clip for the questions: four frames (4, 64, 96, 3), half a second apart."""
     return np.stack([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 40)]), np.arange(4) / 2
 
 
 def tiny_subject(family: Family, folder: Path) -> Subject:
-    """A tiny checkpoint of a family, built, saved and loaded again, and the clip."""
+    """Return a tiny checkpoint of a family, built, saved and loaded again, and the clip."""
     return Subject(tiny_model(family, folder / family), *brightening())

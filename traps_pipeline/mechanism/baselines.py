@@ -40,15 +40,15 @@ Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the orde
 
 
 def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ProbeBaselineRow]:
-    """Rows of PROBE_BASELINES for the items of an extraction. Raises TrapsError for a damaged clip."""
+    """Return rows of PROBE_BASELINES for the items of an extraction. Raises TrapsError for a damaged clip."""
     settings = workspace.mechanism
     items = {name: probed_items(workspace, states, name) for name in dict.fromkeys(states.items["dataset"])}
     assert entry.media is not None, "local entries have media"
-    found: list[ProbeBaselineRow] = []
+    result: list[ProbeBaselineRow] = []
 
     def add(features: str, rows: Sequence[Row], note: str | None = None) -> None:
         names = ("analysis", "source", "target", "scope", "value", "low", "high", "spread", "n_voids", "n_controls")
-        found.extend(
+        result.extend(
             ProbeBaselineRow(
                 **states.extraction.partition, features=features, note=note, **{name: row[name] for name in names}
             )
@@ -66,20 +66,20 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     except NoMargin as error:
         add(MARGIN, [_without_figure()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
-    return found
+    return result
 
 
 class AsItIs:
     """A score that needs no fit: the one column of the features, larger for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """The column, (n,)."""
+        """Return the column, (n,)."""
         return states[:, 0]
 
 
 def scored(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Row]:
-    """The rows of the protocol on features in the place of states, those of nearest centroids included. fit: another
-    probe than the protocol's."""
+    """Return the rows of the protocol on features in the place of states, those of nearest centroids included. fit:
+    another probe than the protocol's."""
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
     return on.comparable(0) + on.centroids(0)
 
@@ -88,21 +88,21 @@ def scored(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Ro
 
 
 def probed_items(workspace: Workspace, states: StoredStates, dataset: str) -> pd.DataFrame:
-    """The PROBE_ITEMS rows of a dataset in the order of its states."""
+    """Return the PROBE_ITEMS rows of a dataset in the order of its states."""
     rows = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}).set_index("item_id")
-    wanted = states.dataset(dataset)["item_id"]
-    missing = sorted(set(wanted) - set(rows.index))
+    items = states.dataset(dataset)["item_id"]
+    missing = sorted(set(items) - set(rows.index))
     if missing:
         raise TrapsError(
             f"probe_items {dataset}: has no {missing[0]}, which has states; materialize hidden_states again"
         )
-    return rows.loc[list(wanted)].reset_index()
+    return rows.loc[list(items)].reset_index()
 
 
 def raw_features(
     items: Mapping[str, pd.DataFrame], spec: MediaSpec, resolve: Callable[[str], Path]
 ) -> dict[str, Features]:
-    """RAW features by name, then by dataset, (n, columns).
+    """Return RAW features by name, then by dataset, (n, columns).
 
     question words: which words and pairs of words the question has. first frame: its pixels at THUMBNAIL. all frames:
     those of all frames that the model is shown, with the mean in the place of a missing one. length: the clip's last
@@ -125,27 +125,28 @@ def raw_features(
         times = seen[row["times_clip"] or row["clip"]][1]
         return [len(seen[row["clip"]][1]), times[0], times.mean(), times[-1]]
 
-    made: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
+    features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
         records = rows.astype(object).where(rows.notna(), None).to_dict("records")
-        made["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
-        made["first frame"][dataset] = np.stack([seen[row["clip"]][0][0].ravel() for row in records])
-        made["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in records])
-        made["length"][dataset] = np.array([[seen[row["clip"]][2]] for row in records])
-        made["time stamps"][dataset] = np.array([stamps(row) for row in records])
-    return dict(made)
+        features["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
+        features["first frame"][dataset] = np.stack([seen[row["clip"]][0][0].ravel() for row in records])
+        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in records])
+        features["length"][dataset] = np.array([[seen[row["clip"]][2]] for row in records])
+        features["time stamps"][dataset] = np.array([stamps(row) for row in records])
+    return dict(features)
 
 
 def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Thumbnails (N, h, w, 3) in [0, 1] and times (N,) of the frames that a model is shown, and the last one's time."""
+    """Return thumbnails (N, h, w, 3) in [0, 1] and times (N,) of the frames that a model is shown, and the last one's
+    time."""
     import cv2
 
     try:
-        shown = sample(clip, spec)
+        frames = sample(clip, spec)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
-    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in shown.frames]
-    return np.stack(small) / 255, shown.times_s, float(shown.times_s[-1])
+    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in frames.frames]
+    return np.stack(small) / 255, frames.times_s, float(frames.times_s[-1])
 
 
 class NoMargin(TrapsError):
@@ -183,7 +184,7 @@ def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[s
 
 
 def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]:
-    """Rows of the protocol on noise: mean over draws, and their deviation as `spread`.
+    """Return rows of the protocol on noise: mean over draws, and their deviation as `spread`.
 
     Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items that are one prompt
     (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows what shared

@@ -125,7 +125,8 @@ def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) 
 
 
 def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
-    """How often each scenario counts, (1 + RESAMPLES, scenarios): first once, then resampled within its taxonomy."""
+    """Return how often each scenario counts, (1 + RESAMPLES, scenarios): first once, then resampled within its
+    taxonomy."""
     drawn, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
         if n := int(np.count_nonzero(of == taxonomy)):

@@ -37,17 +37,19 @@ class Gate:
     made_of: str
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
-        """The probe's log-odds of void for a prompt: one pass of the plain model."""
+        """Return the probe's log-odds of void for a prompt: one pass of the plain model."""
         with model.remembering_clips():
             states = model.forward_states(prompt, self.pooling).raw[self.layer]
         return float(self.probe.scores(states[None])[0])
 
     def abstains(self, model: LocalModel, prompt: Prompt) -> bool:
-        """Whether the gate turns the model's answer to a prompt into an abstention."""
+        """Return whether the gate turns the model's answer to a prompt into an abstention."""
         return self.score(model, prompt) > self.threshold
 
     def answer(self, model: LocalModel, prompt: Prompt, max_new_tokens: int = 512) -> str:
-        """The model's greedy answer to a prompt, or ABSTENTION where the gate abstains, without generating any."""
+        """Return the model's greedy answer to a prompt, or ABSTENTION where the gate abstains, without generating
+        any.
+        """
         return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
 
 
@@ -61,7 +63,7 @@ def fitted_gate(
     layer: int | None = None,
     without: Collection[str] = (),
 ) -> Gate:
-    """A gate of a source, one of `gate.SOURCES`, fitted on the study's stored states.
+    """Return a gate of a source, one of `gate.SOURCES`, fitted on the study's stored states.
 
     target: the dataset that `other datasets` leaves out. layer: that of the gate stage by default. without: scenarios,
     or families as `gate.families` names them, that the gate must not have seen. Raises TrapsError for another source or
@@ -95,10 +97,10 @@ def fitted_gate(
 
 def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:
     table = gate_table(states)
-    there = [name for name in DATASETS if name in set(table["dataset"])]
-    names = sources_of_gate(source, target, there)
+    present = [name for name in DATASETS if name in set(table["dataset"])]
+    names = sources_of_gate(source, target, present)
     if not names:
-        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(there) or 'no dataset'}")
+        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(present) or 'no dataset'}")
     table = table.loc[table["dataset"].isin(names)].reset_index(drop=True)
     unseen = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
     features = {name: states.read(name, layer) for name in names}

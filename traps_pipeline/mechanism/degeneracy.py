@@ -11,7 +11,7 @@ LONGEST = 8  # words of a repeated phrase
 
 
 def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | None:
-    """Why a text is no answer, or None if it is one.
+    """Return why a text is no answer, or None if it is one.
 
     `truncated`: the limit of tokens cut it off (outcome). `repetition`: a phrase of one to eight words stands four
     times in a row. `script`: most of its letters are of another script than those of the unsteered answer to the same
@@ -28,7 +28,7 @@ def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | N
 
 
 def repeats(text: str) -> bool:
-    """Whether a phrase of at most LONGEST words stands REPEATED times in a row."""
+    """Return whether a phrase of at most LONGEST words stands REPEATED times in a row."""
     words = text.lower().split()
     for size in range(1, LONGEST + 1):
         same = 0
@@ -40,7 +40,7 @@ def repeats(text: str) -> bool:
 
 
 def script(text: str) -> str:
-    """The script of most letters, by the first word of their Unicode names (LATIN, CJK, CYRILLIC); empty for a text
-    without letters."""
+    """Return the script of most letters, by the first word of their Unicode names (LATIN, CJK, CYRILLIC); empty for a
+    text without letters."""
     names = Counter(unicodedata.name(letter, "?").split()[0] for letter in text if letter.isalpha())
     return names.most_common(1)[0][0] if names else ""

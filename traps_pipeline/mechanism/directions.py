@@ -37,7 +37,8 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """The scenarios in an order by seed and name alone, so that a discarded one does not change the others' order."""
+    """Return the scenarios in an order by seed and name alone, so that a discarded one does not change the others'
+    order."""
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
@@ -98,8 +99,8 @@ class Directions:
 def extract_directions(
     void: np.ndarray, control: np.ndarray, seed: Sequence[int], nulls: Sequence[str] = NULLS, draws: int = 1
 ) -> Directions:
-    """Directions from states (layers, pairs, d) of the two sides, with the pairs in the same order, and so many draws
-    of each kind of null.
+    """Return directions from states (layers, pairs, d) of the two sides, with the pairs in the same order, and so many
+    draws of each kind of null.
 
     A layer at which the sides do not differ at all (the embeddings of a last token that is the same everywhere) has a
     zero vector, not a direction that consists of rounding errors; so has a null of which the projection leaves nothing.
@@ -119,12 +120,12 @@ def extract_directions(
         if kind in nulls:
             drawn = _null_draws(kind, void, control, np.random.default_rng([*seed, number]), draws)
             vectors[kind] = _orthogonal(drawn, unit)
-    found = {kind: of.astype(np.float32) for kind, of in vectors.items()}
-    return Directions(found, gaps, np.linalg.norm(control, axis=2).mean(axis=1))
+    directions = {kind: of.astype(np.float32) for kind, of in vectors.items()}
+    return Directions(directions, gaps, np.linalg.norm(control, axis=2).mean(axis=1))
 
 
 def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random.Generator, draws: int) -> np.ndarray:
-    """Draws of a kind of null before the projection, (draws, layers, d)."""
+    """Return draws of a kind of null before the projection, (draws, layers, d)."""
     layers, pairs, width = void.shape
     if kind == "isotropic":
         return rng.standard_normal((draws, layers, width))
@@ -136,18 +137,18 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
 
 
 def _orthogonal(drawn: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """The unit vectors of what is left of draws (draws, layers, d) without their part along `unit` (layers, d); zero
-    where hardly anything is left, and where `unit` itself is zero."""
-    left = drawn - (drawn * unit).sum(axis=2, keepdims=True) * unit
-    left -= (left * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
-    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (drawn, left))
+    """Return the unit vectors of what is left of draws (draws, layers, d) without their part along `unit` (layers, d);
+    zero where hardly anything is left, and where `unit` itself is zero."""
+    remainder = drawn - (drawn * unit).sum(axis=2, keepdims=True) * unit
+    remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
+    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (drawn, remainder))
     differs = np.abs(unit).max(axis=1) > 0
     kept = (after > _NOTHING_LEFT * before) & differs[None, :, None]
-    return np.where(kept, left / np.where(kept, after, 1), 0.0)
+    return np.where(kept, remainder / np.where(kept, after, 1), 0.0)
 
 
 def vector_digest(vector: np.ndarray) -> str:
-    """Digest of a direction's float32 numbers."""
+    """Return digest of a direction's float32 numbers."""
     return hashlib.sha256(np.ascontiguousarray(vector, "<f4").tobytes()).hexdigest()[:32]
 
 
@@ -165,8 +166,8 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
-    """The directions that `save_directions` wrote, and the content of their JSON file. Raises TrapsError when a file is
-    missing, or when the digest in the JSON file is another."""
+    """Return the directions that `save_directions` wrote, and the content of their JSON file. Raises TrapsError when a
+    file is missing, or when the digest in the JSON file is another."""
     require("local")
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
@@ -190,7 +191,7 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
 
 
 def cosine_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Cosines of unit vectors (k, d): (k, k). NaN where one of the two is zero."""
+    """Return cosines of unit vectors (k, d): (k, k). NaN where one of the two is zero."""
     vectors = np.asarray(vectors, np.float64)
     lengths = np.linalg.norm(vectors, axis=1)
     with np.errstate(invalid="ignore"):

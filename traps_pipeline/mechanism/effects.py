@@ -26,15 +26,17 @@ REGIME_COLUMNS = (
 
 
 def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
-    """The effects at the steered layer, which alone has both sides: a sweep's further layers have only controls."""
+    """Return the effects at the steered layer, which alone has both sides: a sweep's further layers have only
+    controls.
+    """
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
-    """One row per path and strength at the steered layer, with transfer_type and the abstention of control and void; if
-    the effects have intervals, counts, doses in class gaps or shares of degenerate answers, also `control_low` and so
-    on."""
+    """Return one row per path and strength at the steered layer, with transfer_type and the abstention of control and
+    void; if the effects have intervals, counts, doses in class gaps or shares of degenerate answers, also `control_low`
+    and so on."""
     import pandas as pd
 
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
@@ -51,14 +53,14 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
-    """REGIME_COLUMNS: mean abstention over the paths of each set at alpha 0 and at the largest alpha, by direction
-    regime, inference regime and kind of direction; family `all`."""
+    """Return REGIME_COLUMNS: mean abstention over the paths of each set at alpha 0 and at the largest alpha, by
+    direction regime, inference regime and kind of direction; family `all`."""
     return _regime_rows(effects, lambda rows: iter([("all", rows)]))
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """The columns of `regime_matrix` for guided directions under guided inference, by taxonomy of the direction's
-    source (`family`)."""
+    """Return the columns of `regime_matrix` for guided directions under guided inference, by taxonomy of the
+    direction's source (`family`)."""
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
 
     def families(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -72,7 +74,7 @@ def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
     import pandas as pd
 
     rows = paths(effects)
-    found: list[Mapping[str, Any]] = []
+    result: list[Mapping[str, Any]] = []
     for path_set, members in PATH_SETS.items():
         inside = [pair in members for pair in zip(rows["source"], rows["target"], strict=True)]
         for (model, directions, regime, kind), cell in rows.loc[inside].groupby([*CELL, "kind"], sort=False):  # pyright: ignore[reportGeneralTypeIssues]
@@ -83,18 +85,18 @@ def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
                 ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
                 sides = ("control", "void")
                 figures = {f"{side}_{end}": at[side].mean() for side in sides for end, at in ends.items()}
-                found.append(
+                result.append(
                     {
                         **{"model": model, "path_set": path_set, "family": family, "directions": directions},
                         **{"regime": regime, "kind": kind, "n_paths": len(ends["top"]), "alpha": top, **figures},
                     }
                 )
-    return pd.DataFrame(found, columns=pd.Index(REGIME_COLUMNS))
+    return pd.DataFrame(result, columns=pd.Index(REGIME_COLUMNS))
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Control abstention at the largest alpha along each source's direction: on the well-posed dataset of the source's
-    own taxonomy (same) and of the other taxonomy (cross). Columns CELL, source, alpha, same, cross."""
+    """Return control abstention at the largest alpha along each source's direction: on the well-posed dataset of the
+    source's own taxonomy (same) and of the other taxonomy (cross). Columns CELL, source, alpha, same, cross."""
     import pandas as pd
 
     rows = paths(effects)
@@ -110,8 +112,8 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Control abstention by layer and alpha, with each dataset's direction on its own controls, as a mean over the four
-    datasets. Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered."""
+    """Return control abstention by layer and alpha, with each dataset's direction on its own controls, as a mean over
+    the four datasets. Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered."""
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
     grouped = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
@@ -121,8 +123,8 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
-    """The effects of every dataset along its own direction and its nulls, signs by label, at the layer that has both
-    sides; with `gaps`, the dose in units of the class gap. Without a dose in that unit there are no rows."""
+    """Return the effects of every dataset along its own direction and its nulls, signs by label, at the layer that has
+    both sides; with `gaps`, the dose in units of the class gap. Without a dose in that unit there are no rows."""
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     both = own.loc[own["side"] == "void", ["model", "layer"]].drop_duplicates()
     own = in_gaps(own.merge(both, on=["model", "layer"]), own)
@@ -130,8 +132,8 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
-    """Effects with `gaps`, their strength in units of the class gap of the direction's own dataset, which is read off
-    the doses in that unit among `every` effect; NaN where there is none."""
+    """Return effects with `gaps`, their strength in units of the class gap of the direction's own dataset, which is
+    read off the doses in that unit among `every` effect; NaN where there is none."""
     keys = ["model", "directions", "source", "layer"]
     length = every.loc[(every["unit"] == "gap") & (every["dose"] > 0) & (every["kind"] == "void")]
     length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)
@@ -140,7 +142,7 @@ def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with sources and targets in the benchmark's order."""
+    """Return the rows with sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
     by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
     kinds = {kind: place for place, kind in enumerate(KINDS)}

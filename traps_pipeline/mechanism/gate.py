@@ -37,7 +37,7 @@ class Items:
     features: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Items:
-        """The items that a boolean mask chooses."""
+        """Return the items that a boolean mask chooses."""
         return Items(self.table.loc[chosen].reset_index(drop=True), self.features[chosen])
 
     @property
@@ -58,7 +58,7 @@ class Decisions:
 
 
 def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[str, float]:
-    """The three thresholds from calibrating scores (n,) and labels (n,); a score above a threshold is gated.
+    """Return the three thresholds from calibrating scores (n,) and labels (n,); a score above a threshold is gated.
 
     mid: half-way between the mean scores of voids and of controls. J: the cut with the largest AbsRec - FalseAbs,
     half-way to the next score. conformal: the smallest control score that at most a share `false_abs` of new controls
@@ -76,7 +76,7 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
 
 
 def sources_of_gate(source: str, target: str, there: Sequence[str] = DATASETS) -> list[str]:
-    """The datasets that a gate of SOURCES is fitted on for a target, of those that a study has."""
+    """Return the datasets that a gate of SOURCES is fitted on for a target, of those that a study has."""
     if source == OTHER_DATASETS:
         return [name for name in there if name != target]
     return [name for name in there if source in (OTHER_FAMILIES, f"one:{name}")]
@@ -85,16 +85,16 @@ def sources_of_gate(source: str, target: str, there: Sequence[str] = DATASETS) -
 def decide(
     items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
 ) -> Decisions:
-    """The decisions of the gates of a source about every item of a target dataset.
+    """Return the decisions of the gates of a source about every item of a target dataset.
 
     A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
     other scenarios. Its thresholds come from scores of those same source items in a cross-validation of their own, so
     that they are scores of unseen items too; items that are one prompt count once. Raises TrapsError for a source
     without items.
     """
-    wanted = items.table["dataset"].to_numpy(str)
-    scored = np.flatnonzero(wanted == target)
-    inside = np.isin(wanted, sources_of_gate(source, target))
+    targets = items.table["dataset"].to_numpy(str)
+    scored = np.flatnonzero(targets == target)
+    inside = np.isin(targets, sources_of_gate(source, target))
     if not inside.any():
         raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
     groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
@@ -116,8 +116,8 @@ def decide(
 def fit_gate(
     train: Items, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
 ) -> tuple[Scorer, dict[str, float], dict[str, float]]:
-    """A gate from its source's items: the probe, its thresholds by name, and the share of the calibrating controls
-    above each. There must be both sides, in two scenarios or more."""
+    """Return a gate from its source's items: the probe, its thresholds by name, and the share of the calibrating
+    controls above each. There must be both sides, in two scenarios or more."""
     probe = fit_probe(train.features, train.void, solver)
     calibrating, void = _own_scores(train, folds, seed, solver)
     cuts = thresholds(calibrating, void, false_abs)
@@ -125,7 +125,7 @@ def fit_gate(
 
 
 def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
-    """The groups of scored items that a gate must not have seen, one gate after another."""
+    """Yield the groups of scored items that a gate must not have seen, one gate after another."""
     names = np.unique(groups)
     if source == OTHER_FAMILIES or len(names) < folds:
         yield from (names[k : k + 1] for k in range(len(names)))
@@ -135,7 +135,9 @@ def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iter
 
 
 def _own_scores(train: Items, folds: int, seed: int, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
-    """Scores and labels of the source's distinct prompts, each by a probe that was not fitted on its scenario."""
+    """Return scores and labels of the source's distinct prompts, each by a probe that was not fitted on its
+    scenario.
+    """
     fold = scenario_folds(train.table["scenario_id"].to_numpy(str), folds, seed)
     score = np.full(len(fold), np.nan)
     for k in range(folds):
@@ -158,8 +160,8 @@ class Outcomes:
     abstained: np.ndarray
 
     def gated(self, gate: np.ndarray) -> Outcomes:
-        """The outcomes after a gate (n,) bool has turned answers into abstentions. An undecided answer that is gated is
-        decided: it abstains."""
+        """Return the outcomes after a gate (n,) bool has turned answers into abstentions. An undecided answer that is
+        gated is decided: it abstains."""
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
     def figures(self, weight: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -168,13 +170,13 @@ class Outcomes:
         weight = np.ones((1, len(self.void))) if weight is None else weight
         parts = {"acc": (~self.void, self.correct), "false_abs": (~self.void, self.abstained)}
         parts |= {"abs_rec": (self.void, self.abstained)}
-        found: dict[str, np.ndarray] = {}
+        shares: dict[str, np.ndarray] = {}
         for name, (side, values) in parts.items():
             kept = side & np.isfinite(values)
             with np.errstate(invalid="ignore", divide="ignore"):
-                found[name] = (weight[:, kept] @ values[kept]) / weight[:, kept].sum(axis=1)
-        found["pecs"] = found["acc"] * np.maximum(0, found["abs_rec"] - found["false_abs"])
-        return found
+                shares[name] = (weight[:, kept] @ values[kept]) / weight[:, kept].sum(axis=1)
+        shares["pecs"] = shares["acc"] * np.maximum(0, shares["abs_rec"] - shares["false_abs"])
+        return shares
 
     def counts(self) -> np.ndarray:
         """Return how often each item is yes and is decided for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""
@@ -185,7 +187,7 @@ class Outcomes:
 
 
 def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
-    """(coverage, risk, answers kept) where answers are given up from the highest score down.
+    """Return (coverage, risk, answers kept) where answers are given up from the highest score down.
 
     Answered items are those on which the model did not abstain. Coverage is the share of all items that are answered
     and kept; risk the share of kept answers that are wrong: every answer to a void, and a control's that is not
@@ -204,11 +206,11 @@ def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[flo
 
 
 def separation(decisions: Decisions, void: np.ndarray) -> float:
-    """AUROC of a gate's scores on its target, whose labels are void (n,); NaN with one side alone."""
+    """Return AUROC of a gate's scores on its target, whose labels are void (n,); NaN with one side alone."""
     known = np.isfinite(decisions.score)
     return float(auroc(void[known], decisions.score[known]))
 
 
 def families(items: pd.DataFrame) -> np.ndarray:
-    """The family of each item for `other families`: its sub-scenario with its taxonomy."""
+    """Return the family of each item for `other families`: its sub-scenario with its taxonomy."""
     return np.array([f"{probed_taxonomy(d)}:{s}" for d, s in zip(items["dataset"], items["sub_scenario"], strict=True)])

@@ -66,7 +66,7 @@ class Gates:
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
-    """Rows of GATE of an extraction, for each regime that the model was asked under in run 1.
+    """Return rows of GATE of an extraction, for each regime that the model was asked under in run 1.
 
     Raises TrapsError when the model has no verdicts yet.
     """
@@ -79,7 +79,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
-    """Rows of RISK_COVERAGE of an extraction: gates from other datasets, and as `gate_rows` else."""
+    """Return rows of RISK_COVERAGE of an extraction: gates from other datasets, and as `gate_rows` else."""
     return [
         row
         for regime, outcomes, gates, _, made in _each(workspace, entry, states, (OTHER_DATASETS,))
@@ -93,7 +93,7 @@ Made = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 def _each(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, sources: Sequence[str]
 ) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, Made]]:
-    """Regime, its outcomes, features, source and decisions of every gate."""
+    """Yield regime, its outcomes, features, source and decisions of every gate."""
     outcomes = {
         regime: found for regime in PROMPTING if (found := outcomes_of(workspace, entry.id, regime, states)) is not None
     }
@@ -107,14 +107,14 @@ def _each(
     kinds = [*_kinds(workspace, entry, states, layers, sources)]
     for number, gates in enumerate(kinds):
         progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
-        made = _decisions(workspace, table, gates, layers)
+        decisions = _decisions(workspace, table, gates, layers)
         for regime, source in product(outcomes, gates.sources):
-            own = {target: one for (of, target), one in made.items() if of == source}
+            own = {target: one for (of, target), one in decisions.items() if of == source}
             yield regime, outcomes[regime], gates.name, source, own
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """The items of all datasets in the order of `states.items`, as a gate wants them."""
+    """Return the items of all datasets in the order of `states.items`, as a gate wants them."""
     items = states.items
     named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
@@ -130,7 +130,7 @@ def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[
 def _kinds(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int], sources: Sequence[str]
 ) -> Iterator[Gates]:
-    """States with every source; the controls with the sources that no single dataset's accidents decide."""
+    """Yield states with every source; the controls with the sources that no single dataset's accidents decide."""
     names = [*dict.fromkeys(states.items["dataset"])]
     yield Gates(STATES, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, sources)
     controls = (OTHER_DATASETS,)
@@ -160,21 +160,21 @@ def _decisions(
     """By source and target, a gate's decisions and the layer of its states (-1 for other features)."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
-    made: dict[tuple[str, str], tuple[Decisions, int]] = {}
-    there = [name for name in DATASETS if name in set(table["dataset"])]
+    decisions: dict[tuple[str, str], tuple[Decisions, int]] = {}
+    present = [name for name in DATASETS if name in set(table["dataset"])]
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
-        if not sources_of_gate(source, str(target), there):
+        if not sources_of_gate(source, str(target), present):
             continue  # a study of some datasets has the gates that these allow
         layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
         items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
-        found = decide(items, source, str(target), solver=settings.probes.solver, **about)
-        if np.isfinite(found.score).any():
-            made[source, str(target)] = found, layer
-    return made
+        decision = decide(items, source, str(target), solver=settings.probes.solver, **about)
+        if np.isfinite(decision.score).any():
+            decisions[source, str(target)] = decision, layer
+    return decisions
 
 
 def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
-    """The table with its features; with shuffled labels, where a coin for each scenario swaps its sides."""
+    """Return the table with its features; with shuffled labels, where a coin for each scenario swaps its sides."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, of in features.items():
         values[(table["dataset"] == name).to_numpy()] = of
@@ -185,9 +185,9 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
 
 
 def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
-    """Outcomes by dataset, in the order of the states; None if the four datasets that have states have no verdicts.
-    Items without verdicts (those that no model is asked) have undecided ones."""
-    found: dict[str, Outcomes] = {}
+    """Return outcomes by dataset, in the order of the states; None if the four datasets that have states have no
+    verdicts. Items without verdicts (those that no model is asked) have undecided ones."""
+    outcomes: dict[str, Outcomes] = {}
     judged = False
     for dataset in dict.fromkeys(states.items["dataset"]):
         items = states.dataset(dataset)
@@ -200,8 +200,8 @@ def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredSta
         correct, abstained = (
             rows[name].astype("Float64").to_numpy(float, na_value=np.nan) for name in ("correct", "abstained")
         )
-        found[dataset] = Outcomes((items["side"] == "void").to_numpy(), correct, abstained)
-    return found if judged else None
+        outcomes[dataset] = Outcomes((items["side"] == "void").to_numpy(), correct, abstained)
+    return outcomes if judged else None
 
 
 def _rows(
@@ -212,7 +212,7 @@ def _rows(
     resamples: int,
     seed: int,
 ) -> list[GateRow]:
-    """The rows of one gate (features, regime, source) on every target and over the four datasets."""
+    """Return the rows of one gate (features, regime, source) on every target and over the four datasets."""
     rows: list[GateRow] = []
     names = states.items["scenario_id"].to_numpy(str)
     for threshold in THRESHOLDS:
@@ -293,18 +293,18 @@ def _curves(
     made: Made,
     outcomes: Mapping[str, Outcomes],
 ) -> list[RiskCoverageRow]:
-    """Risk against coverage over the four datasets together; a score counts from its own gate's mid threshold, so that
-    the scores of four gates are comparable."""
+    """Return risk against coverage over the four datasets together; a score counts from its own gate's mid threshold,
+    so that the scores of four gates are comparable."""
     own = [name for name in made if name in DATASETS]
     if not own:
         return []
     score = np.concatenate([made[name][0].score - made[name][0].threshold[MID] for name in own])
     parts = [outcomes[name] for name in own]
-    whole = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
-    points = [(features, *point) for point in risk_coverage(score, whole, COVERAGES)]
+    pooled = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
+    points = [(features, *point) for point in risk_coverage(score, pooled, COVERAGES)]
     if features == STATES:
-        answered = int((whole.abstained == 0).sum())
-        wrong = np.where(whole.void, 1.0, 1 - whole.correct)[whole.abstained == 0]
+        answered = int((pooled.abstained == 0).sum())
+        wrong = np.where(pooled.void, 1.0, 1 - pooled.correct)[pooled.abstained == 0]
         points.append((NO_GATE, answered / len(score), float(np.nanmean(wrong)) if answered else 0.0, answered))
     return [
         RiskCoverageRow(**states.extraction.partition, regime=regime, features=name, coverage=c, risk=r, n=n)

@@ -85,7 +85,7 @@ def clip_item(
     model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str,
     times: Path | None = None, other: tuple[Path, str] | None = None,
 ) -> Item:  # fmt: skip
-    """The item that asks a question about a clip under a system prompt.
+    """Return the item that asks a question about a clip under a system prompt.
 
     row: a row of the items table (item_id, side, question, media_digest; times_digest where there is `times`). spec:
     how the model is shown a clip. times: another clip, whose frame times are shown in the place of the clip's own.
@@ -93,8 +93,8 @@ def clip_item(
     """
 
     def asked(frames_of: Path) -> Prompt:
-        shown = sample(frames_of, spec)
-        return model.prompt(system, row["question"], shown.frames, shown_times(shown, frames_of, spec, times))
+        frames = sample(frames_of, spec)
+        return model.prompt(system, row["question"], frames.frames, shown_times(frames, frames_of, spec, times))
 
     about = {"question": row["question"], "clip": row["media_digest"], "media": profile_digest(spec), "system": system}
     if times is not None:
@@ -104,8 +104,8 @@ def clip_item(
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
-    """The times (N,) in seconds that stand beside a clip's shown frames: its own, or those of another clip, spread over
-    as many frames if the other one has more or fewer."""
+    """Return the times (N,) in seconds that stand beside a clip's shown frames: its own, or those of another clip,
+    spread over as many frames if the other one has more or fewer."""
     if times is None or times == clip:
         return shown.times_s
     other = sample(times, spec).times_s
@@ -115,7 +115,8 @@ def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) 
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
-    """Digest of everything that an item's states depend on: its prompt, the checkpoint, its precision, the pooling."""
+    """Return digest of everything that an item's states depend on: its prompt, the checkpoint, its precision, the
+    pooling."""
     return digest({"about": dict(item.about), "model": model.identity, "pooling": pooling})
 
 
@@ -136,7 +137,7 @@ def extract(
     disk cannot be written.
     """
     keys = [states_key(model, item, pooling) for item in items]
-    known, made, here = dict[str, _Place](), 0, FolderStore(folder)
+    known, count, here = dict[str, _Place](), 0, FolderStore(folder)
     with alone(here, _WRITING):
         _look_for(folder, known)
     total = sum(key not in known for key in keys)
@@ -145,14 +146,14 @@ def extract(
             _look_for(folder, known)  # another process may have had this chunk
         missing = [(items[n], keys[n]) for n in chunk if keys[n] not in known]
         if missing:
-            tick = partial(_tick, what, made, total)
-            made += _make(model, missing, folder, pooling, tick, known)
+            tick = partial(_tick, what, count, total)
+            count += _make(model, missing, folder, pooling, tick, known)
     with alone(here, _WRITING):
         _write_ids(folder, items, keys, known, _record(model, pooling))
         _sweep(folder, {known[key][0] for key in keys})
     _note_devices(folder, sorted({known[key][2] for key in keys}))
     version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
-    return Extracted(folder, len(items), made, version)
+    return Extracted(folder, len(items), count, version)
 
 
 def _tick(what: str, before: int, total: int, done: int) -> None:
@@ -168,7 +169,8 @@ def _look_for(folder: Path, known: dict[str, _Place]) -> None:
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
-    """The items of a finished extraction (item_id, side, key, device) and their states at one layer, (n, d) float32.
+    """Return the items of a finished extraction (item_id, side, key, device) and their states at one layer, (n, d)
+    float32.
 
     layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (the latter after the final norm). Raises
     TrapsError for an extraction that is not finished, a layer that does not exist, or a damaged shard.
@@ -187,7 +189,8 @@ def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFra
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """The model and settings of an extraction: checkpoint and digest, class, precision, pooling, n_layers, d_model.
+    """Return the model and settings of an extraction: checkpoint and digest, class, precision, pooling, n_layers,
+    d_model.
 
     Raises TrapsError for an extraction that is not finished.
     """
@@ -218,24 +221,24 @@ def _make(
 
 
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
-    """The states of an item, pooled over the tokens that the pooling names."""
+    """Return the states of an item, pooled over the tokens that the pooling names."""
     chosen = _chosen(model, prompt, item, pooling)
     with model.remembering_clips():
         return model.forward_states(prompt, pooling, chosen=chosen)
 
 
 def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
-    """The tokens over which states are pooled; None where the pooling says so itself. Raises TrapsError for a part that
-    the prompt does not have (a model that writes no time stamps, a pair with equal clips)."""
+    """Return the tokens over which states are pooled; None where the pooling says so itself. Raises TrapsError for a
+    part that the prompt does not have (a model that writes no time stamps, a pair with equal clips)."""
     if pooling not in OF_PARTS:
         return None
     parts = spans(model, prompt, item.about["system"], item.about["question"])
-    found = parts[pooling] if pooling not in OF_PAIRS else _of_pair(parts["visual"], prompt, item)[pooling]
-    if not found.any():
+    positions = parts[pooling] if pooling not in OF_PAIRS else _of_pair(parts["visual"], prompt, item)[pooling]
+    if not positions.any():
         raise TrapsError(
             f"{item.item_id}: its prompt for {model.checkpoint.name} has no {pooling}; choose another pooling"
         )
-    return found
+    return positions
 
 
 def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
@@ -249,7 +252,7 @@ def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.nda
 
 
 def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
-    """Items with their prompts; the next ones are decoded while the model works."""
+    """Yield items with their prompts; the next ones are decoded while the model works."""
     with ThreadPoolExecutor(1) as pool:
         waiting: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
         try:
@@ -289,8 +292,8 @@ def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Poo
 
 
 def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFrame]]:
-    """The complete shards but those seen: name and table. Tensors without a table come from a killed run; `_sweep`
-    removes them."""
+    """Yield the complete shards but those seen: name and table. Tensors without a table come from a killed run;
+    `_sweep` removes them."""
     for path in sorted(path for path in folder.glob("shard-*.parquet") if path.stem not in seen):
         try:
             table = read_sealed(path).to_pandas()
@@ -339,7 +342,7 @@ def _record(model: LocalModel, pooling: Pooling) -> dict[str, Any]:
 
 
 def _tensor(file: Path, name: str) -> np.ndarray:
-    """One tensor of a shard as float32. Raises TrapsError for a damaged file."""
+    """Return one tensor of a shard as float32. Raises TrapsError for a damaged file."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -355,7 +358,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
 
 
 def _sound_rows(file: Path) -> int:
-    """How many items a shard holds. Raises TrapsError unless every tensor of it is what was written."""
+    """Return how many items a shard holds. Raises TrapsError unless every tensor of it is what was written."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -370,7 +373,8 @@ def _sound_rows(file: Path) -> int:
 
 
 def damage(file: Path) -> str:
-    """What is wrong with a file of an extraction (tensors or table), in words; empty where it is what was written."""
+    """Return what is wrong with a file of an extraction (tensors or table), in words; empty where it is what was
+    written."""
     try:
         _sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
     except (OSError, ValueError, TrapsError) as error:

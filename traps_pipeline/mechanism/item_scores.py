@@ -25,24 +25,24 @@ from traps_pipeline.storage.workspace import Workspace
 def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ItemScoreRow]:
     """Return the rows of ITEM_SCORES of an extraction: one for each item of a dataset of pairs."""
     settings, table = workspace.mechanism, gate_table(states)
-    there = [name for name in DATASETS if len(states.dataset(name))]
-    layers = chosen_layers(workspace, states, there)
+    present = [name for name in DATASETS if len(states.dataset(name))]
+    layers = chosen_layers(workspace, states, present)
     outcomes = {regime: outcomes_of(workspace, entry.id, regime, states) for regime in PROMPTING}
     try:
-        margins = output_margins(entry, states, there)
+        margins = output_margins(entry, states, present)
     except NoMargin as error:
         progress.current().note(f"item_scores: no output margin ({error})")
         margins = {}
     about = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
     rows: list[ItemScoreRow] = []
-    for dataset in there:
+    for dataset in present:
         features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
         scores: dict[str, np.ndarray] = {}
         items = gate_items(table, features, shuffled=False, seed=settings.seed)
         for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
-            if sources_of_gate(source, dataset, there):
-                found = decide(items, source, dataset, solver=settings.probes.solver, **about)
-                scores[name] = found.score - found.threshold[MID]
+            if sources_of_gate(source, dataset, present):
+                decision = decide(items, source, dataset, solver=settings.probes.solver, **about)
+                scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {
                 f"abstained_{regime}": _decided(of[dataset].abstained[place] if of else np.nan)

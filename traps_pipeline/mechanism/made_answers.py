@@ -39,31 +39,31 @@ class MadeAnswers:
         self._store, self._folder, self._size = store, folder, size
         self._of: dict[str, Chunk] = {}
 
-    def chunks(self, wanted: Sequence[Request]) -> list[Chunk]:
-        """The calls of a cell in chunks, which are known from now on."""
-        calls = list({request.key: request for request in wanted}.values())
+    def chunks(self, requests: Sequence[Request]) -> list[Chunk]:
+        """Return the calls of a cell in chunks, which are known from now on."""
+        calls = list({request.key: request for request in requests}.values())
         parts = [calls[first : first + self._size] for first in range(0, len(calls), self._size)]
-        found = [Chunk(digest([each.key for each in part])[:16], {each.key: each for each in part}) for part in parts]
-        for chunk in found:
+        result = [Chunk(digest([each.key for each in part])[:16], {each.key: each for each in part}) for part in parts]
+        for chunk in result:
             self._of |= dict.fromkeys(chunk.calls, chunk)
-        return found
+        return result
 
     def outcomes(self, requests: Sequence[Request], make: Make, stopped: Callable[[], bool]) -> list[Outcome]:
-        """What came of calls, which are of known chunks: as another process made them, or made here. Waits while
+        """Return what came of calls, which are of known chunks: as another process made them, or made here. Waits while
         another process makes some of them, unless it is stopped."""
         chunks = {chunk.name: chunk for request in requests if (chunk := self._of.get(request.key))}
         with ExitStack() as leases:
-            found: dict[str, Outcome] = {}
+            known: dict[str, Outcome] = {}
             for chunk in chunks.values():
                 while (lease := self._lease(chunk)) is None and not stopped():
                     time.sleep(POLL_S)
                 if lease is not None:
                     leases.enter_context(closing(lease))
-                found |= self._read(chunk)
-            missing = [request for request in requests if request.key not in found]
+                known |= self._read(chunk)
+            missing = [request for request in requests if request.key not in known]
             if missing:
-                found |= zip([each.key for each in missing], make(missing, stopped), strict=True)
-        return [found[request.key] for request in requests]
+                known |= zip([each.key for each in missing], make(missing, stopped), strict=True)
+        return [known[request.key] for request in requests]
 
     def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
         """Make the answers of a chunk that are not known, unless another process is at it (None); their number."""
@@ -71,19 +71,19 @@ class MadeAnswers:
         if lease is None:
             return None
         with closing(lease):
-            made = self._read(chunk)
-            settled = known(list(chunk.calls)) | {*made}
+            stored = self._read(chunk)
+            settled = known(list(chunk.calls)) | {*stored}
             missing = [request for key, request in chunk.calls.items() if key not in settled]
             if missing:
                 outcomes = make(missing, lambda: False)
-                made |= zip([each.key for each in missing], outcomes, strict=True)
-                written = json.dumps({key: asdict(each) for key, each in made.items()})
+                stored |= zip([each.key for each in missing], outcomes, strict=True)
+                written = json.dumps({key: asdict(each) for key, each in stored.items()})
                 self._store.write({self._path(chunk): written.encode()})
             return len(missing)
 
-    def forget(self, wanted: Sequence[Request]) -> None:
+    def forget(self, requests: Sequence[Request]) -> None:
         """Remove the answers to calls that the ledger holds now."""
-        chunks = {chunk.name: chunk for request in wanted if (chunk := self._of.get(request.key))}
+        chunks = {chunk.name: chunk for request in requests if (chunk := self._of.get(request.key))}
         self._store.remove(map(self._path, chunks.values()))
         with suppress(OSError):  # unless there are others
             self._folder.rmdir()
@@ -108,7 +108,7 @@ class MadeAnswers:
 
 
 def is_written(ledger: Ledger, evaluation: str) -> bool:
-    """Whether another process writes an evaluation now."""
+    """Return whether another process writes an evaluation now."""
 
     async def try_it() -> bool:
         try:

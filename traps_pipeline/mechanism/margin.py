@@ -24,28 +24,28 @@ _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
 def begins_abstention(token: str) -> bool:
-    """Whether a token's text begins an abstention: a whole phrase of PHRASES with whatever follows it, or the first
-    word of one. "I" counts, although other sentences begin with it too: the margin is a lower bound of what the first
-    token says."""
+    """Return whether a token's text begins an abstention: a whole phrase of PHRASES with whatever follows it, or the
+    first word of one. "I" counts, although other sentences begin with it too: the margin is a lower bound of what the
+    first token says."""
     text = token.strip().lower().replace("\u2019", "'")
     return text in _FIRST_WORDS or text.startswith(PHRASES)
 
 
 def abstention_tokens(model: LocalModel) -> list[int]:
-    """The tokens of a model's vocabulary with which an abstention begins. Raises TrapsError if there is none."""
+    """Return the tokens of a model's vocabulary with which an abstention begins. Raises TrapsError if there is none."""
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
-    found = [token for token, text in enumerate(texts) if begins_abstention(text)]
-    if not found:
+    tokens = [token for token, text in enumerate(texts) if begins_abstention(text)]
+    if not tokens:
         raise TrapsError(
             f"{model.checkpoint.name}: no token of its vocabulary begins an abstention ({', '.join(PHRASES)}), so its "
             "output margin cannot be read; set `patching: null` in the experiment and in study.yaml"
         )
-    return found
+    return tokens
 
 
 def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
-    """Log-odds of `tokens` against all others but `never`, from logits (.., vocabulary): (..)."""
+    """Return log-odds of `tokens` against all others but `never`, from logits (.., vocabulary): (..)."""
     import torch
 
     chosen = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)

@@ -23,8 +23,8 @@ _AT = [*_CELL, "layer", "unit", "dose", "side"]
 
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
-    """Rows of STEERING_NULLS: every dataset along its own direction, and the mean over datasets. Without nulls there
-    are no rows."""
+    """Return rows of STEERING_NULLS: every dataset along its own direction, and the mean over datasets. Without nulls
+    there are no rows."""
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     moved = _moved(own)
     drawn = moved.loc[moved["kind"].isin(NULLS)]
@@ -36,8 +36,8 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
 
 
 def _moved(own: pd.DataFrame) -> pd.DataFrame:
-    """Steered effects with `moved`, the change against the unsteered answers in the direction that is claimed: more
-    abstention on controls, less on voids."""
+    """Return steered effects with `moved`, the change against the unsteered answers in the direction that is claimed:
+    more abstention on controls, less on voids."""
     path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
     plain = own.loc[own["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
     steered = own.loc[own["dose"] != 0].merge(plain, on=path)
@@ -75,13 +75,13 @@ def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
 
 
 def nulled(figures: Mapping[str, float]) -> dict[str, Any]:
-    """The figures with null in the place of NaN, as tables have them."""
+    """Return the figures with null in the place of NaN, as tables have them."""
     return {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
-    """Rows of STEERING_PECS: every path, dose and sign policy of the void directions that was steered on both sides.
-    Figures without a decided answer are null."""
+    """Return rows of STEERING_PECS: every path, dose and sign policy of the void directions that was steered on both
+    sides. Figures without a decided answer are null."""
     keys = [*_CELL, "source", "target", "layer", "unit", "dose", "signs"]
     rows: list[SteeringPecsRow] = []
     for key, group in effects.loc[effects["kind"] == VOID].groupby(keys, sort=True):

@@ -12,7 +12,9 @@ from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, standardiser
 
 
 def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
-    """The probe whose weights are the difference of the sides' standardised means; 0 lies half-way between them."""
+    """Return the probe whose weights are the difference of the sides' standardised means; 0 lies half-way between
+    them.
+    """
     mean, scale = standardiser(np.asarray(states, float))
     standard = (states - mean) / scale
     sides = standard[void].mean(axis=0), standard[~void].mean(axis=0)
@@ -21,8 +23,8 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
 
 
 def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """A probe of any scikit-learn classifier or pipeline; make: returns a new one. Scores are its decision function, or
-    the log-odds of its probabilities."""
+    """Return a probe of any scikit-learn classifier or pipeline; make: returns a new one. Scores are its decision
+    function, or the log-odds of its probabilities."""
 
     def fit(states: np.ndarray, void: np.ndarray) -> Scorer:
         return _Estimator(make().fit(states, void))
@@ -55,7 +57,7 @@ class Eraser:
 
     @staticmethod
     def of(states: np.ndarray, void: np.ndarray) -> Eraser:
-        """The erasure of which side an item is on, from states (n, d) and void (n,)."""
+        """Return the erasure of which side an item is on, from states (n, d) and void (n,)."""
         states = np.asarray(states, float)
         mean, label = states.mean(axis=0), void - np.mean(void)
         left, size, right = np.linalg.svd(states - mean, full_matrices=False)
@@ -65,11 +67,11 @@ class Eraser:
         return Eraser(mean, (towards / size[kept]) @ right[kept], (towards * size[kept]) @ right[kept])
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        """States (m, d) without the concept."""
+        """Return states (m, d) without the concept."""
         states = np.asarray(states, float)
         return states - np.outer((states - self.mean) @ self.read, self.written)
 
 
 def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """States (n, d) from which no linear classifier can tell the sides, by the `Eraser` of these very states."""
+    """Return states (n, d) from which no linear classifier can tell the sides, by the `Eraser` of these very states."""
     return Eraser.of(states, void)(states)

@@ -129,7 +129,7 @@ class Pairs:
         return estimates, patches
 
     def _each(self, kind: str, make: Callable[[str], Iterable[Row]], kept: set[Path]) -> list[Row]:
-        """The rows of all pairs: read where a file holds them, else made and written."""
+        """Return the rows of all pairs: read where a file holds them, else made and written."""
         rows, store = list[Row](), self._workspace.store
         for number, name in enumerate(self._names, start=1):
             path = self._folder / f"{name}-{self._version}-{kind}.json"
@@ -175,25 +175,25 @@ class Pairs:
             del plain  # before the other side's pass is recorded
 
     def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
-        """The margins of both sides, and the estimated change by each token; the states are gone afterwards."""
+        """Return the margins of both sides, and the estimated change by each token; the states are gone afterwards."""
         plain = record(self._model, target.prompt, self._tokens, ())
         source = record(self._model, own.prompt, self._tokens, self._settings.sites)
         return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
 
     def _patched(self, target: Recorded, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
-        """The margin of a source, and the changes by patches from it; its states are gone afterwards."""
+        """Return the margin of a source, and the changes by patches from it; its states are gone afterwards."""
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
-        """Each side of a pair that has both, with the other side and the groups of positions."""
+        """Yield each side of a pair that has both, with the other side and the groups of positions."""
         if all((name, side) in self._items for side in SIDES):
             for into, towards in (SIDES, SIDES[::-1]):
                 target, own = self._side(name, into), self._side(name, towards)
                 yield into, target, own, groups_of(target, own)
 
     def _source(self, name: str, into: str, kind: str) -> Side | None:
-        """The side that patches into a pair's side come from; None if there is none of its form."""
+        """Return the side that patches into a pair's side come from; None if there is none of its form."""
         towards = SIDES[1 - SIDES.index(into)]
         where = {OWN: (name, towards, ""), TIMES: (name, into, towards)}
         if kind in where:
@@ -217,9 +217,9 @@ class Pairs:
         row = self._items[name, which]
         clip, question = self._workspace.resolve(row["clip"]), str(row["question"])
         other = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
-        shown = sample(clip, self._spec)
-        times = shown_times(shown, clip, self._spec, other)
-        prompt = self._model.prompt(self._system, question, shown.frames, times)
+        frames = sample(clip, self._spec)
+        times = shown_times(frames, clip, self._spec, other)
+        prompt = self._model.prompt(self._system, question, frames.frames, times)
         side = Side(prompt, spans(self._model, prompt, self._system, question))
         self._parts[name, which, times_of] = side.parts
         return side
@@ -234,14 +234,14 @@ def _row(
     ends: tuple[float, float],
     change: float,
 ) -> Row:
-    """What a patch does to one pair. ends: the outcomes of the side that is patched and of the other one."""
+    """Return what a patch does to one pair. ends: the outcomes of the side that is patched and of the other one."""
     site, layer, group = cell
     about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
     return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
 
 
 def _fits(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
-    """Whether two prompts have the same form, part by part."""
+    """Return whether two prompts have the same form, part by part."""
     return all(np.array_equal(target[part], source[part]) for part in ("system", "stamps", "visual"))
 
 
@@ -278,8 +278,8 @@ def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: i
 def summed(
     estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
 ) -> Iterator[PatchingRow]:
-    """The rows of a dataset: ratios of sums over pairs, with intervals by scenario for what was patched. Where all
-    pairs were left out, a row without an effect says so."""
+    """Yield the rows of a dataset: ratios of sums over pairs, with intervals by scenario for what was patched. Where
+    all pairs were left out, a row without an effect says so."""
     left_out = Counter((row["into"], row["source"]) for row in (*estimates, *patches) if "left_out" in row)
     cells = [defaultdict[tuple[Any, ...], list[Row]](list), defaultdict[tuple[Any, ...], list[Row]](list)]
     for by_cell, rows in zip(cells, (estimates, patches), strict=True):

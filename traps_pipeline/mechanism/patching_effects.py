@@ -91,7 +91,7 @@ class Recorded:
 
 
 def require_patchable(model: LocalModel) -> None:
-    """Raises TrapsError for a model whose later blocks read more of earlier ones than is replaced here."""
+    """Raise TrapsError for a model whose later blocks read more of earlier ones than is replaced here."""
     unknown = unknown_path(model.network.config.get_text_config(), model.blocks[0])
     if unknown:
         raise TrapsError(
@@ -227,14 +227,15 @@ def _require_one_form(target: Recorded, source: Recorded) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """The layer whose recorded state a patched pass can begin with. Raises TrapsError for a site that is not there."""
+    """Return the layer whose recorded state a patched pass can begin with. Raises TrapsError for a site that is not
+    there."""
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1
 
 
 def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
-    """The weights of a pass with one row for each patch behind a row without any."""
+    """Return the weights of a pass with one row for each patch behind a row without any."""
     import torch
 
     masks: dict[tuple[Site, int], Tensor] = {}
@@ -245,13 +246,15 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
 
 def _behind(weights: Weights, layer: int) -> Tensor | None:
-    """The weights of residual patches at a layer or below it, which are all behind them."""
+    """Return the weights of residual patches at a layer or below it, which are all behind them."""
     parts = [part for (site, at), part in weights.items() if site == "residual" and at <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
 def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
-    """States (rows, .., T, d), of which the source's, (T, d) or (1, .., T, d), take the part that weights say."""
+    """Return states (rows, .., T, d), of which the source's, (T, d) or (1, .., T, d), take the part that weights
+    say.
+    """
     import torch
 
     weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
@@ -268,7 +271,7 @@ def _margins(
     rows: int,
     tokens: Sequence[int],
 ) -> Tensor:
-    """The outcomes (rows,) of a pass over so many copies of the target, from the state at layer `start` on."""
+    """Return the outcomes (rows,) of a pass over so many copies of the target, from the state at layer `start` on."""
     inputs = _repeated(target, rows)
     if ("residual", 0) in weights:
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
@@ -284,7 +287,7 @@ def _margins(
 
 
 def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
-    """The decoder's inputs for so many rows of one prompt."""
+    """Return the decoder's inputs for so many rows of one prompt."""
     import torch
 
     length, inputs = target.length, dict(target.inputs)
@@ -312,7 +315,9 @@ def _replacing(
         return target.states["residual", layer].expand(rows, -1, -1) if layer == start else hidden_states
 
     def beside(below: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """The arguments of the block above `below` others, with the source's where the stream below was patched."""
+        """Return the arguments of the block above `below` others, with the source's where the stream below was
+        patched.
+        """
         own, behind = given(block, PER_LAYER, args, kwargs), _behind(weights, below)
         if own is not None and behind is not None:
             args, kwargs = giving(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)

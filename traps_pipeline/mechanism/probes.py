@@ -31,7 +31,7 @@ class Split:
     scenario: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Split:
-        """The chosen items; chosen is a mask or indices."""
+        """Return the chosen items; chosen is a mask or indices."""
         return Split(self.states[chosen], self.void[chosen], self.scenario[chosen])
 
 
@@ -45,7 +45,7 @@ class Probe:
     intercept: float
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """Log-odds of void, (n,), for states (n, d)."""
+        """Return log-odds of void, (n,), for states (n, d)."""
         slope = self.weights / self.scale
         return states @ slope + (self.intercept - self.mean @ slope)
 
@@ -54,7 +54,7 @@ class Scorer(Protocol):
     """What is fitted: anything that scores states, higher for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """Scores (n,) of states (n, d)."""
+        """Return scores (n,) of states (n, d)."""
         ...
 
 
@@ -64,7 +64,7 @@ Fit = Callable[[np.ndarray, np.ndarray], Scorer]  # states (n, d), void (n,) boo
 
 
 def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and population standard deviation of each column, (d,) each. As in scikit-learn's StandardScaler the
+    """Return mean and population standard deviation of each column, (d,) each. As in scikit-learn's StandardScaler the
     deviation is 1 where a column is constant up to rounding."""
     mean, variance = states.mean(axis=0), states.var(axis=0)
     rounding = len(states) * np.finfo(float).eps
@@ -73,7 +73,7 @@ def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_probe(states: np.ndarray, void: np.ndarray, solver: Solver = "exact", penalty: float = PENALTY) -> Probe:
-    """The probe of states (n, d) with labels (n,). Raises TrapsError when one class has no item."""
+    """Return the probe of states (n, d) with labels (n,). Raises TrapsError when one class has no item."""
     _check_labels(void)
     states = np.asarray(states, float)
     mean, scale = standardiser(states)
@@ -102,8 +102,8 @@ def _reference(standard: np.ndarray, void: np.ndarray, penalty: float) -> tuple[
 
 
 def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> tuple[np.ndarray, float]:
-    """The logistic regression with an unpenalised intercept, by its Gram matrix (n, n): dual coefficients (n,) and
-    intercept. The coefficients of the columns are the rows' transpose times the dual.
+    """Return the logistic regression with an unpenalised intercept, by its Gram matrix (n, n): dual coefficients (n,)
+    and intercept. The coefficients of the columns are the rows' transpose times the dual.
 
     At the minimum the dual is penalty * (label - probability) and sums to 0. Newton's step solves
     (I + W gram) step + W intercept_step = residual of that condition, with W = penalty * p (1 - p), through
@@ -158,14 +158,14 @@ class _NewtonStep:
         self._by_intercept = self._inverse(weight)
 
     def _inverse(self, right: np.ndarray) -> np.ndarray:
-        """(I + W gram)^-1 right."""
+        """Return (I + W gram)^-1 right."""
         from scipy.linalg import cho_solve
 
         scaled = self._root * (self._gram @ right)
         return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
 
     def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
-        """The step of the dual, after which the dual sums to 0, and the step of the intercept."""
+        """Return the step of the dual, after which the dual sums to 0, and the step of the intercept."""
         free = self._inverse(missing)
         intercept_step = float((free.sum() + dual_sum) / self._by_intercept.sum())
         return free - intercept_step * self._by_intercept, intercept_step
@@ -180,7 +180,7 @@ def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np
 
 
 def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,). Ties count half.
+    """Return area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,). Ties count half.
 
     By mean ranks (Mann and Whitney). NaN where one class has no item.
     """
@@ -197,8 +197,8 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Percentile interval of the AUROC from resampled scenarios, with the probe held fixed, and with a floor: where all
-    resamples agree (a probe that separates 16 pairs), percentiles would say that the value is certain.
+    """Return percentile interval of the AUROC from resampled scenarios, with the probe held fixed, and with a floor:
+    where all resamples agree (a probe that separates 16 pairs), percentiles would say that the value is certain.
 
     The floor is the exact binomial one. If a share s of n scenarios fails, none of them fails with probability
     (1 - s)^n; so with n scenarios of the scarcer side, an interval reaches down to at least ((1 - level) / 2)^(1/n),
@@ -224,7 +224,7 @@ def auroc_interval(
 
 
 def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """The fold of each item, (n,) int: items of a scenario share one, and folds differ by one scenario at most.
+    """Return the fold of each item, (n,) int: items of a scenario share one, and folds differ by one scenario at most.
 
     Raises TrapsError when there are fewer scenarios than folds.
     """
@@ -238,7 +238,7 @@ def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
 
 
 def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
-    """Labels (n, shuffles) in which the sides of each scenario are swapped with probability 0.5.
+    """Return labels (n, shuffles) in which the sides of each scenario are swapped with probability 0.5.
 
     A swap keeps every fold balanced, and any labels of a held-out fold are as likely as their complement, so that the
     expected AUROC is exactly 0.5. A free permutation, which unbalances the folds, would only approach 0.5.
@@ -249,7 +249,7 @@ def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: 
 
 
 def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: Solver = "exact") -> np.ndarray:
-    """Cross-validated AUROC of each labelling (n, k), averaged over folds: (k,).
+    """Return cross-validated AUROC of each labelling (n, k), averaged over folds: (k,).
 
     Standardiser and probe use only the training folds; all labellings share the Gram matrix of a fold.
     """
@@ -274,8 +274,8 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: So
 
 
 def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
-    """Whether each of states (n, d) is assigned to void, (n,) bool, by the source's standardiser and centroids and by
-    cosine distance; with equal distances it is assigned to control."""
+    """Return whether each of states (n, d) is assigned to void, (n,) bool, by the source's standardiser and centroids
+    and by cosine distance; with equal distances it is assigned to control."""
     _check_labels(source.void)
     known = np.asarray(source.states, float)
     mean, scale = standardiser(known)
@@ -292,7 +292,7 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source. No label of a
-    target is read."""
+    """Return scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source. No label
+    of a target is read."""
     probes = {source: fit(layer[source].states, layer[source].void) for source in {s for s, _ in pairs}}
     return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

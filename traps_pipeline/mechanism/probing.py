@@ -61,18 +61,18 @@ class Confabulated:
 
 
 def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> frozenset[str]:
-    """The scenarios on whose void item the model did not abstain; undecided items are left out.
+    """Return the scenarios on whose void item the model did not abstain; undecided items are left out.
 
     verdicts: those of the dataset under Standard in run 1. Raises NothingConfabulated if there is no such scenario.
     """
     void = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].notna()]
-    found = frozenset(void.loc[~void["abstained"].astype(bool), "scenario_id"])
-    if not found:
+    scenarios = frozenset(void.loc[~void["abstained"].astype(bool), "scenario_id"])
+    if not scenarios:
         raise NothingConfabulated(
             f"{model} confabulated on none of the {len(void)} judged void items of {dataset} under standard: there is "
             "no Cf->Cf probe of this dataset; take more scenarios, or read the all-sample curves"
         )
-    return found
+    return scenarios
 
 
 @dataclass
@@ -134,7 +134,7 @@ class ProbeRun:
     # --- the parts of the protocol ---
 
     def rows(self, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Row]:
-        """Every row of the probes table without the columns that partition it."""
+        """Return every row of the probes table without the columns that partition it."""
         rows: list[Row] = []
         for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
             rows += of_layer
@@ -142,13 +142,14 @@ class ProbeRun:
         return marked(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
-        """Every row of one layer, whose states are in memory only during this call."""
+        """Return every row of one layer, whose states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
         rows = self.comparable(layer, splits) + self.within(layer, splits)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """The rows of one layer that baselines have as well: transfer, held out, Cf->Cf, look-alikes, swapped times."""
+        """Return the rows of one layer that baselines have as well: transfer, held out, Cf->Cf, look-alikes, swapped
+        times."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
         unseen = {source: self._unseen_scores(source, splits) for source in self._own}
         rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
@@ -156,21 +157,21 @@ class ProbeRun:
         return rows + self.answerable(layer, splits, unseen) + self.time_swapped(layer, splits, unseen)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """The twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so that
-        half of the rows of a cross-modality target were used in the fit (see `held_out`)."""
+        """Return the twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so
+        that half of the rows of a cross-modality target were used in the fit (see `held_out`)."""
         scores = transfer_scores(splits, self._pairs, self._fit)
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """The same pairs with source and target restricted to confabulated void items and their own controls."""
+        """Return the same pairs with source and target restricted to confabulated void items and their own controls."""
         restricted = self._confabulated(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
         scores = transfer_scores(restricted, pairs, self._fit)
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Those of these pairs whose datasets share their controls, by probes that were fitted without the scored
-        scenario; without a figure where too few scenarios are left to split."""
+        """Return those of these pairs whose datasets share their controls, by probes that were fitted without the
+        scored scenario; without a figure where too few scenarios are left to split."""
         restricted, rows = self._confabulated(splits), []
         for source, target in self._pairs:
             if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):
@@ -188,7 +189,7 @@ class ProbeRun:
         return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
 
     def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
-        """Why probes of a source cannot leave a fold of scenarios out; empty if they can."""
+        """Return why probes of a source cannot leave a fold of scenarios out; empty if they can."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
@@ -196,13 +197,13 @@ class ProbeRun:
         return f"{path_name(*splits)}, held out: {n} confabulated voids are too few for {folds} folds of scenarios"
 
     def _folds(self, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """The fold of each item, by dataset; a scenario has one fold in all of them."""
+        """Return the fold of each item, by dataset; a scenario has one fold in all of them."""
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
         return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Grouped cross-validation within each dataset, with the true and with swapped labels."""
+        """Return grouped cross-validation within each dataset, with the true and with swapped labels."""
         rows = []
         for name in self._own:
             split = splits[name]
@@ -217,7 +218,7 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """The pairs within a taxonomy, and each dataset on itself, by probes that were fitted without the scored
+        """Return the pairs within a taxonomy, and each dataset on itself, by probes that were fitted without the scored
         scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
         return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
@@ -225,8 +226,8 @@ class ProbeRun:
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Clips that can be answered although they look like voids, scored by the probes of each dataset: void clips
-        with a question that they answer, decoys (a panel that hides nothing), and whole clips as short as a void.
+        """Return clips that can be answered although they look like voids, scored by the probes of each dataset: void
+        clips with a question that they answer, decoys (a panel that hides nothing), and whole clips as short as a void.
 
         answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have (a panel, the
         length), 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC of these against
@@ -251,8 +252,8 @@ class ProbeRun:
     def time_swapped(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Chaotic's frames with the times of the other side, whose label is that of the frames: 1 for a probe that
-        reads the frames, 0 for one that reads the time stamps."""
+        """Return chaotic's frames with the times of the other side, whose label is that of the frames: 1 for a probe
+        that reads the frames, 0 for one that reads the time stamps."""
         if TIME_SWAPPED not in splits:
             return []
         of = splits[TIME_SWAPPED]
@@ -266,8 +267,8 @@ class ProbeRun:
         return scores[name][mask], splits[name].scenario[mask]
 
     def _unseen_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Scores of the items of every dataset by probes that were not fitted on their scenarios: one probe for items
-        of another taxonomy, one per fold for those of the source's own."""
+        """Return scores of the items of every dataset by probes that were not fitted on their scenarios: one probe for
+        items of another taxonomy, one per fold for those of the source's own."""
         split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
         others = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
@@ -283,9 +284,9 @@ class ProbeRun:
         return scores
 
     def centroids(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """Shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void. The
-        centroids of a taxonomy's two datasets come from the same controls, so that of their controls these shares are
-        too low; `baselines` has the same of noise."""
+        """Return shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void.
+        The centroids of a taxonomy's two datasets come from the same controls, so that of their controls these shares
+        are too low; `baselines` has the same of noise."""
         splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:
             assigned, split = nearest_centroid(splits[source], splits[target].states), splits[target]
@@ -306,7 +307,7 @@ class ProbeRun:
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
 
     def _problems(self) -> list[Row]:
-        """A row with the reason, and without a figure, for each Cf->Cf pair that cannot be computed."""
+        """Return a row with the reason, and without a figure, for each Cf->Cf pair that cannot be computed."""
         rows = []
         for source, target in self._pairs:
             reasons = [self.confabulated.problems[n] for n in (source, target) if n in self.confabulated.problems]
@@ -316,8 +317,8 @@ class ProbeRun:
 
 
 def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]:
-    """The results of `work` for each layer, in order. Each core works on one layer, at most four at a time, since each
-    holds its states in memory.
+    """Yield the results of `work` for each layer, in order. Each core works on one layer, at most four at a time, since
+    each holds its states in memory.
 
     Linear algebra uses one thread per layer: at these sizes a second thread costs more than it saves.
     """

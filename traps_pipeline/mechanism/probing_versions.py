@@ -22,8 +22,8 @@ SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
-    """The parameters of a local model that its states depend on: those of its entry without sampling, in the precision
-    in which states are read."""
+    """Return the parameters of a local model that its states depend on: those of its entry without sampling, in the
+    precision in which states are read."""
     inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
     params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
     skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
@@ -37,12 +37,12 @@ def shown_inside(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
 
 
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
-    """The folder of a partition's shards."""
+    """Return the folder of a partition's shards."""
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
 
 
 def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
-    """Whether the extraction of a partition was finished and all of its files still exist."""
+    """Return whether the extraction of a partition was finished and all of its files still exist."""
     from traps_pipeline.storage.parquet import read_sealed
 
     folder = states_folder(workspace, cell)
@@ -55,14 +55,15 @@ def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
 
 
 def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
-    """Whether all files in the directions table of an extraction exist."""
+    """Return whether all files in the directions table of an extraction exist."""
     paths = {workspace.root / path for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
     files = paths | {path.with_suffix(".json") for path in paths}
     return workspace.store.sizes(files).keys() == files
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt, pooling."""
+    """Return digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt,
+    pooling."""
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     if settings is not None and entry.id in settings.models:
         entry = shown_inside(entry, settings)
@@ -76,7 +77,7 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Digest of the study's settings for the probes and directions of a model."""
+    """Return digest of the study's settings for the probes and directions of a model."""
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -90,7 +91,9 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Digest of the inputs of sentences besides items and answers: those of states, the sentences, the prompt."""
+    """Return digest of the inputs of sentences besides items and answers: those of states, the sentences, the
+    prompt.
+    """
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -99,7 +102,7 @@ def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def patching_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
+    """Return digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
     settings = workspace.study.mechanism
     if settings is None or settings.patching is None or extraction.model not in settings.models:
         return "none"
@@ -108,7 +111,8 @@ def patching_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def steering_version(workspace: Workspace, run: str) -> str:
-    """Digest of the inputs of steered answers besides items and directions: the study's settings, model and prompt."""
+    """Return digest of the inputs of steered answers besides items and directions: the study's settings, model and
+    prompt."""
     model, _, regime = run.split("__")
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:

@@ -43,14 +43,14 @@ _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of answers, votes or effects that follow the paper's protocol: void directions, doses in alpha, and
-    signs by label. Unsteered answers (alpha 0) are among them."""
+    """Return the rows of answers, votes or effects that follow the paper's protocol: void directions, doses in alpha,
+    and signs by label. Unsteered answers (alpha 0) are among them."""
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 
 def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """The answers with their verdicts, one row for every path that an answer belongs to; an unsteered answer (alpha 0)
-    belongs to every path."""
+    """Return the answers with their verdicts, one row for every path that an answer belongs to; an unsteered answer
+    (alpha 0) belongs to every path."""
     copied = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
@@ -61,9 +61,9 @@ def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """The answers with `abstained` and `correct`, the majority's decisions; null without a text, votes or a majority,
-    and `correct` on voids. Each cell is decided by itself: after a change of panel, a cell has votes of the old panel
-    until its votes are made again."""
+    """Return the answers with `abstained` and `correct`, the majority's decisions; null without a text, votes or a
+    majority, and `correct` on voids. Each cell is decided by itself: after a change of panel, a cell has votes of the
+    old panel until its votes are made again."""
     votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
     for cell, of_cell in answers.groupby(_CELL, sort=False):
@@ -74,7 +74,7 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
 
 
 def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffectRow]:
-    """Rows of STEERING_EFFECTS: abstention by path, kind, draw, layer, dose, signs and side."""
+    """Return rows of STEERING_EFFECTS: abstention by path, kind, draw, layer, dose, signs and side."""
     rows: list[SteeringEffectRow] = []
     for key, group in answers_of_paths(answers, votes).groupby(_EFFECT, sort=True):
         about = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
@@ -108,9 +108,9 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set, for each regime
-    of directions and of answers and over all regimes, with an interval from resampled scenarios (all paths share the
-    scenarios of a resample, and the unseen one)."""
+    """Return rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set, for each
+    regime of directions and of answers and over all regimes, with an interval from resampled scenarios (all paths share
+    the scenarios of a resample, and the unseen one)."""
     decided = answers_of_paths(of_paper(answers), of_paper(votes)).dropna(subset=["abstained"])
     decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
     rows: list[SteeringShareRow] = []
@@ -162,7 +162,7 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
 
 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """The sets of paths that are averaged: the columns that name each set, and its rows of `paths`."""
+    """Yield the sets of paths that are averaged: the columns that name each set, and its rows of `paths`."""
     pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
     every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
     for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):

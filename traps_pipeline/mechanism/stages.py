@@ -80,15 +80,15 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     model, system = load_local_model(entry, inside=True), states_prompt(settings.system, cell.extraction.prompt)
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
-    wanted = [
+    asked_of = [
         probed_item(workspace, model, entry.media, {str(k): v for k, v in item.items()}, system) for item in items
     ]
     held = workspace.store.below(folder)
     workspace.store.bring(held)
-    done = extract(model, wanted, folder, pooling=settings.pooling, what=f"items of {cell.key}")
-    made = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    workspace.store.keep(made)
-    workspace.store.remove({*held} - {*made})
+    done = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
+    files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    workspace.store.keep(files)
+    workspace.store.remove({*held} - {*files})
     record, (ids, _) = read_record(folder), read_layer(folder, 0)
     keys, devices = (dict(zip(ids["item_id"], ids[name], strict=True)) for name in ("key", "device"))
     source = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
@@ -112,8 +112,8 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
 
 
 def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:
-    """The item of a row of PROBE_ITEMS, as the study pools its states. Raises TrapsError where a pooling compares the
-    clips of a pair and the scenario lacks one."""
+    """Return the item of a row of PROBE_ITEMS, as the study pools its states. Raises TrapsError where a pooling
+    compares the clips of a pair and the scenario lacks one."""
     from traps_pipeline.mechanism.hidden_states import clip_item
     from traps_pipeline.models.local.capture import OF_PAIRS
 
@@ -123,7 +123,7 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
-    """Those of the first and last layers that hold a number that is not finite."""
+    """Return those of the first and last layers that hold a number that is not finite."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
     folder = workspace.bring_folder(states_folder(workspace, cell))
@@ -131,7 +131,7 @@ def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> lis
 
 
 def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
-    """Raises TrapsError if the study names a layer that the model does not have, before the long extraction begins."""
+    """Raise TrapsError if the study names a layer that the model does not have, before the long extraction begins."""
     layers = workspace.mechanism.models[model]
     for name, layer in (
         ("steering", layers.steering),
@@ -149,7 +149,7 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Rows of an extraction's probes. If none of their inputs has changed, the existing rows are returned."""
+    """Return rows of an extraction's probes. If none of their inputs has changed, the existing rows are returned."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     confabulated = confabulations(workspace, extraction.model)
@@ -182,7 +182,7 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
     """By dataset, the scenarios on whose void the model confabulated under Standard in run 1, or why there is none."""
-    found: dict[str, frozenset[str]] = {}
+    scenarios: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
     for dataset in DATASETS:
         cell = Cell(dataset, Evaluation(model, "standard", 1))
@@ -190,17 +190,17 @@ def confabulations(workspace: Workspace, model: str) -> Confabulated:
             problems[dataset] = f"there are no verdicts {cell.key}; run the model under standard first"
             continue
         try:
-            found[dataset] = confabulated_scenarios(workspace.tables.read(VERDICTS, cell.partition), dataset, model)
+            scenarios[dataset] = confabulated_scenarios(workspace.tables.read(VERDICTS, cell.partition), dataset, model)
         except NothingConfabulated as error:
             problems[dataset] = str(error)
-    return Confabulated(found, problems)
+    return Confabulated(scenarios, problems)
 
 
 # --- directions -------------------------------------------------------------------------------------------------------
 
 
 def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) -> Path:
-    """The file of a dataset's directions."""
+    """Return the file of a dataset's directions."""
     return workspace.root / "directions" / extraction.model / extraction.prompt / f"{dataset}.safetensors"
 
 
@@ -286,9 +286,11 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
 
 
 def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
-    """The directions of an extraction by dataset. Raises TrapsError for a file that is not the one in the table."""
+    """Return the directions of an extraction by dataset. Raises TrapsError for a file that is not the one in the
+    table.
+    """
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
-    found = {}
+    result = {}
     for path in sorted(set(table["path"])):
         workspace.bring([path, str(Path(path).with_suffix(".json"))])
         directions, description = load_directions(workspace.root / path)
@@ -297,5 +299,5 @@ def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, 
             raise TrapsError(
                 f"{path}: differs from the directions in the table; delete it, then `traps run` makes it again"
             )
-        found[description["dataset"]] = directions
-    return found
+        result[description["dataset"]] = directions
+    return result

@@ -38,7 +38,7 @@ class SteeredBackend(LocalBackend):
         """Answer a batch, in the worker thread, but for what another process has made of it."""
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
-    def generate(self, wanted: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
+    def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
         """Answer requests; rows of one layer are generated together, and unsteered rows apart.
 
         stopped: asked at every token, ends early.
@@ -46,13 +46,13 @@ class SteeredBackend(LocalBackend):
         from traps_pipeline.mechanism.hook import Steering
 
         groups: dict[int | None, list[int]] = {}
-        for number, request in enumerate(wanted):
+        for number, request in enumerate(batch):
             steering = request.params["steering"]
             groups.setdefault(steering["layer"] if steering else None, []).append(number)
         outcomes: dict[int, Outcome] = {}
         model = self._model()
         for group, numbers in groups.items():
-            requests = [wanted[number] for number in numbers]
+            requests = [batch[number] for number in numbers]
             prompts = [self._prompt(*_asked(request)) for request in requests]
             hook = None
             if group is not None:
@@ -61,11 +61,11 @@ class SteeredBackend(LocalBackend):
                 hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
             most = requests[0].params["max_new_tokens"]
             with model.remembering_clips():
-                made = model.generate(prompts, most, None, hook, stopped=stopped)
-            for number, one in zip(numbers, made, strict=True):
+                generated = model.generate(prompts, most, None, hook, stopped=stopped)
+            for number, one in zip(numbers, generated, strict=True):
                 counts = (one.prompt_tokens, one.completion_tokens)
                 outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)
-        return [outcomes[number] for number in range(len(wanted))]
+        return [outcomes[number] for number in range(len(batch))]
 
     def _model(self) -> Any:
         from traps_pipeline.models.local.adapter import load_local_model
@@ -73,11 +73,12 @@ class SteeredBackend(LocalBackend):
         return load_local_model(self._entry, inside=True)
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
-        """A processed prompt, kept in memory; `digest` identifies the frames, so a re-rendered clip is a new prompt."""
-        shown = sample(clip, self._spec)
-        return self._model().prompt(system, user, shown.frames, shown.times_s.tolist())
+        """Return a processed prompt, kept in memory; `digest` identifies the frames, so a re-rendered clip is a new
+        prompt."""
+        frames = sample(clip, self._spec)
+        return self._model().prompt(system, user, frames.frames, frames.times_s.tolist())
 
 
 def _asked(request: Request) -> tuple[Any, str | None, str, str]:
-    """What a request's prompt depends on."""
+    """Return what a request's prompt depends on."""
     return request.media, request.media_digest, request.system, request.user

@@ -63,12 +63,12 @@ class Strength:
     signs: str = BY_LABEL
 
     def signed(self, side: str) -> float:
-        """The signed alpha for a row of that side."""
+        """Return the signed alpha for a row of that side."""
         return sign_of(self.signs, side) * self.alpha
 
 
 def sign_of(signs: str, side: str) -> int:
-    """Whether a policy adds (1) or subtracts (-1) on a side."""
+    """Return whether a policy adds (1) or subtracts (-1) on a side."""
     return {"plus": 1, "minus": -1}.get(signs, 1 if side == "control" else -1)
 
 
@@ -88,13 +88,13 @@ class SteeredQuestion(Question):
 def strengths(
     target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
 ) -> list[tuple[Strength, tuple[str, ...]]]:
-    """The strengths with which a target is steered, each with the sides: every path into the target whose source has a
-    direction, the random and shuffled directions of that source, and the sweep over layers (along the target's own
-    direction, on controls alone). directions: by source. Raises TrapsError for a layer that does not exist, and if no
-    source has a direction."""
+    """Return the strengths with which a target is steered, each with the sides: every path into the target whose source
+    has a direction, the random and shuffled directions of that source, and the sweep over layers (along the target's
+    own direction, on controls alone). directions: by source. Raises TrapsError for a layer that does not exist, and if
+    no source has a direction."""
     steering = settings.steering
     assert steering is not None, "an experiment without steering has no steering cells"
-    wanted: list[tuple[Strength, tuple[str, ...]]] = [(NO_STEERING, SIDES)]
+    pairs: list[tuple[Strength, tuple[str, ...]]] = [(NO_STEERING, SIDES)]
     plan = _plan(target, layers, steering, directions)
     if not plan:
         raise TrapsError(f"no direction leads to {target}; materialize hidden_states and directions first")
@@ -114,8 +114,8 @@ def strengths(
             alpha = dose * float(of.gaps[layer]) if unit == "gap" else dose
             relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
-            wanted.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
-    return wanted
+            pairs.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
+    return pairs
 
 
 Dose = tuple[str, float]  # unit and number
@@ -142,8 +142,8 @@ class _Planned(NamedTuple):
 
 
 def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
-    """Every direction along which a target is steered, among these sources: all paths into it; along its own direction
-    also the other sign policies, the nulls at the largest dose, and on controls the sweep over layers."""
+    """Return every direction along which a target is steered, among these sources: all paths into it; along its own
+    direction also the other sign policies, the nulls at the largest dose, and on controls the sweep over layers."""
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
     at = layers.steering
@@ -160,8 +160,8 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """The number of answers that steering a model needs, by inference regime and side; an answer that cells share
-    counts once. scenarios: their number by taxonomy."""
+    """Return the number of answers that steering a model needs, by inference regime and side; an answer that cells
+    share counts once. scenarios: their number by taxonomy."""
     steering = settings.steering
     if steering is None:
         return {}
@@ -222,7 +222,7 @@ def steered_request(
     strength: Strength,
     max_new_tokens: int,
 ) -> Request:
-    """The call for one steered answer: the full benchmark prompt, greedy, in the precision of extraction."""
+    """Return the call for one steered answer: the full benchmark prompt, greedy, in the precision of extraction."""
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     sent = workspace.media.prepare(clip, item["media_digest"], entry.media)
@@ -244,7 +244,7 @@ def steered_request(
 
 
 def shared_item(item: Mapping[str, Any]) -> str:
-    """The item's id for the ledger: a control is one item in both datasets of its taxonomy."""
+    """Return the item's id for the ledger: a control is one item in both datasets of its taxonomy."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
@@ -273,39 +273,39 @@ def collect_steered(
         for vector in draw
     }
 
-    made = MadeAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
+    store = MadeAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
-        wanted = wanted_steered(workspace, entry, cell, directions[cell.directions])
-        made.chunks([each.request for each in wanted])
-        return wanted
+        questions = wanted_steered(workspace, entry, cell, directions[cell.directions])
+        store.chunks([each.request for each in questions])
+        return questions
 
     def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
-        made.forget([each.request for each in settled.calls])
+        store.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
         return settled.made(partial(_steering_row, plain))
 
     def make(entry: Entry) -> SteeredBackend:
-        return SteeredBackend(entry, vectors, made)
+        return SteeredBackend(entry, vectors, store)
 
     for cell in cells:
         if is_written(workspace.answers, cell.evaluation.key):
-            _make_meanwhile(workspace, cell, calls(cell), made, make(entry))
+            _make_meanwhile(workspace, cell, calls(cell), store, make(entry))
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
 
 
 def _make_meanwhile(
     workspace: Workspace,
     cell: SteeringCell,
-    wanted: Sequence[SteeredQuestion],
+    questions: Sequence[SteeredQuestion],
     made: MadeAnswers,
     backend: SteeredBackend,
 ) -> None:
     """Make answers of a cell while another process writes those of its evaluation."""
     report = progress.current()
     report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
-    requests = [each.request for each in wanted]
+    requests = [each.request for each in questions]
     tick = partial(report.tick, "steering", f"chunks of answers of {cell.key}")
     count = make_meanwhile(made, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
     report.note(f"{cell.key}: {count} answers were made for the process that writes them")
@@ -343,8 +343,8 @@ def collect_steering_votes(
 
 
 def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:
-    """The calls for every vote on the steered answers of a cell. A ballot's item is the answer's row with the columns
-    of its item."""
+    """Return the calls for every vote on the steered answers of a cell. A ballot's item is the answer's row with the
+    columns of its item."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
         shared = item | {"item_id": shared_item(answer)}

@@ -26,7 +26,7 @@ class StoredStates:
 
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """The states of an extraction. Raises TrapsError when nothing was extracted."""
+        """Return the states of an extraction. Raises TrapsError when nothing was extracted."""
         items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
@@ -43,20 +43,20 @@ class StoredStates:
         return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
 
     def dataset(self, name: str) -> pd.DataFrame:
-        """The rows of a dataset."""
+        """Return the rows of a dataset."""
         return self.items.loc[self.items["dataset"] == name]
 
     def read(self, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
-        """States (n, d) float32 in the order of the rows; layer `normed` is the last one after the final norm. Raises
-        TrapsError when the shards do not hold these items."""
+        """Return states (n, d) float32 in the order of the rows; layer `normed` is the last one after the final norm.
+        Raises TrapsError when the shards do not hold these items."""
         from traps_pipeline.mechanism.hidden_states import read_layer
 
         cell = StatesCell(dataset, self.extraction)
         ids, states = read_layer(self.workspace.bring_folder(states_folder(self.workspace, cell)), layer)
-        wanted = self.dataset(dataset)
+        rows = self.dataset(dataset)
         # By item, not by key: two items with the same clip and question share one.
-        places = pd.Index(ids["item_id"]).get_indexer(pd.Index(wanted["item_id"]))
-        if (places < 0).any() or (ids["key"].to_numpy()[places] != wanted["states_key"].to_numpy()).any():
+        places = pd.Index(ids["item_id"]).get_indexer(pd.Index(rows["item_id"]))
+        if (places < 0).any() or (ids["key"].to_numpy()[places] != rows["states_key"].to_numpy()).any():
             raise TrapsError(
                 f"hidden states {cell.key}: the shards hold other items than the table; materialize hidden_states for "
                 "it again"

@@ -39,15 +39,15 @@ TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
 
 
 def probed_taxonomy(dataset: str) -> str:
-    """The taxonomy whose scenarios a probed dataset has."""
+    """Return the taxonomy whose scenarios a probed dataset has."""
     return "chaotic" if LOOK_ALIKES.get(dataset, dataset).startswith("chaotic") else "occlusion"
 
 
 def path_name(source: str, target: str) -> str:
-    """`oc→ch_ip`, as tables show it."""
+    """Return `oc→ch_ip`, as tables show it."""
     return f"{SHORT.get(source, source)}→{SHORT.get(target, target)}"
 
 
 def sources_of(target: str) -> tuple[str, ...]:
-    """The datasets along whose directions a target is steered."""
+    """Return the datasets along whose directions a target is steered."""
     return tuple(source for source, other in STEERING_PATHS if other == target)

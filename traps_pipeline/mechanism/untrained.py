@@ -22,8 +22,8 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
-    """The entry's network with random weights, on its device and in its precision, unquantised. It takes the memory of
-    a second model."""
+    """Return the entry's network with random weights, on its device and in its precision, unquantised. It takes the
+    memory of a second model."""
     import torch
 
     trained = load_local_model(entry, inside=True)
@@ -44,18 +44,20 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
 def untrained_states(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, items: Mapping[str, pd.DataFrame]
 ) -> dict[str, np.ndarray]:
-    """The states (n, d) of every item at the middle block of the untrained network, pooled as the study pools."""
+    """Return the states (n, d) of every item at the middle block of the untrained network, pooled as the study
+    pools.
+    """
     model = untrained_model(entry, workspace.mechanism.seed)
     system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"
-    made: dict[str, np.ndarray] = {}
-    found: dict[str, list[np.ndarray]] = {}
+    by_dataset: dict[str, np.ndarray] = {}
+    parts: dict[str, list[np.ndarray]] = {}
     for dataset, rows in items.items():
         keys = states.dataset(dataset)["states_key"]
         for key, row in zip(keys, rows.to_dict("records"), strict=True):
-            if key not in made:
+            if key not in by_dataset:
                 named = {str(name): value for name, value in row.items()}
                 item = probed_item(workspace, model, entry.media, named, system)
-                made[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
-            found.setdefault(dataset, []).append(made[key])
-    return {dataset: np.stack(vectors) for dataset, vectors in found.items()}
+                by_dataset[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
+            parts.setdefault(dataset, []).append(by_dataset[key])
+    return {dataset: np.stack(vectors) for dataset, vectors in parts.items()}

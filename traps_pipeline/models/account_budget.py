@@ -88,7 +88,7 @@ class AccountBudget:
                 self._append(dollars)
 
     def explain(self, worst_usd: float) -> str:
-        """Why there is no room for a call."""
+        """Return why there is no room for a call."""
         spent = self.spent_usd
         return (
             f"the budget of the account {self.account} is reached: {len(spent)} studies have spent "

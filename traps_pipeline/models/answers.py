@@ -40,7 +40,7 @@ class Question(Call):
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
-    """The call that puts an item to a model: frames or video, then the question, nothing else.
+    """Return the call that puts an item to a model: frames or video, then the question, nothing else.
 
     What is sent of the clip is prepared here when it is not yet; every regime and run then shares it.
     """
@@ -62,7 +62,7 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
 
 
 def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]) -> bool:
-    """Whether what is sent of an item's clip is made already."""
+    """Return whether what is sent of an item's clip is made already."""
     spec = framed(entry.media, dataset_of(item["item_id"])) if entry.media else None
     return spec is None or workspace.media.known(item["media_digest"], spec) is not None
 
@@ -84,7 +84,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
-    """Every call that a cell wants, in the order of its items. Raises TrapsError when these are not made."""
+    """Return every call that a cell wants, in the order of its items. Raises TrapsError when these are not made."""
     entry = get_model(cell.evaluation.model)
     items = asked_items(workspace, cell.dataset)
     if not items:
@@ -93,8 +93,8 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """What is asked, told and judged of the items of a dataset, in order. Of equal texts one copy is held: a cell of
-    100,000 items may have a hundred questions."""
+    """Return what is asked, told and judged of the items of a dataset, in order. Of equal texts one copy is held: a
+    cell of 100,000 items may have a hundred questions."""
     copies: dict[str, str] = {}
     rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
     return [
@@ -104,9 +104,9 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
-    """What reference strategies may read: side, labels, on a control its ground truth; the sub-scenario's commonest
-    answer goes to `prior` and to the rules alone, so that a corrected answer which changes it re-asks no other model.
-    A rule reads nothing else, and every other model nothing at all."""
+    """Return what reference strategies may read: side, labels, on a control its ground truth; the sub-scenario's
+    commonest answer goes to `prior` and to the rules alone, so that a corrected answer which changes it re-asks no
+    other model. A rule reads nothing else, and every other model nothing at all."""
     if entry.backend == "rule":
         return {"commonest_answer": item["commonest_answer"]}
     if entry.backend != "reference":
@@ -120,7 +120,7 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
-    """One row of the responses table."""
+    """Return one row of the responses table."""
     thinking = get_model(cell.evaluation.model).thinking
     read = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
     copied = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")

@@ -63,7 +63,7 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 @cache
 def load_litellm() -> Any:
-    """The library, told to send and to fetch nothing of its own. Raises TrapsError where it is not installed."""
+    """Return the library, told to send and to fetch nothing of its own. Raises TrapsError where it is not installed."""
     require("api")
     from traps_pipeline.models.wire import use_in
 
@@ -111,8 +111,8 @@ def _internal_call() -> Any:
 
 
 def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
-    """The message parts that carry a clip. Gemini drops a `video_url` without a word, and samples a video without
-    metadata at 1 FPS: it gets a file part that says its rate."""
+    """Return the message parts that carry a clip. Gemini drops a `video_url` without a word, and samples a video
+    without metadata at 1 FPS: it gets a file part that says its rate."""
     uris = data_uris(media)
     if media.profile == "images":
         return [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
@@ -123,7 +123,7 @@ def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
 
 
 def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
-    """System prompt, then the clip and the question, nothing else (docs/spec.md 3.3)."""
+    """Return system prompt, then the clip and the question, nothing else (docs/spec.md 3.3)."""
     user: str | list[dict[str, Any]] = request.user
     if request.sent is not None:
         route = str(entry.provider_id).split("/")[0]
@@ -149,7 +149,7 @@ class ApiBackend:
         self._told: set[str] = set()
 
     async def ask(self, request: Request) -> Outcome:
-        """One attempt; see `Backend`."""
+        """Return one attempt; see `Backend`."""
         asked = messages(self._entry, request)
         _internal_call().set(True)
         with watching() as exchange:
@@ -215,8 +215,8 @@ class ApiBackend:
             return None
         cost, worst = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
         if not usage.believed and cost > worst:
-            said = f"{usage.prompt} tokens of prompt and {usage.completion} of the answer"
-            self._tell("usage", f"contradicts itself; the most that it says is booked, {said}")
+            counts = f"{usage.prompt} tokens of prompt and {usage.completion} of the answer"
+            self._tell("usage", f"contradicts itself; the most that it says is booked, {counts}")
         return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
@@ -261,14 +261,14 @@ class ApiBackend:
         begins = f", beginning {text[:60]!r}" if text.strip() else ""
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
-    def _tell(self, kind: str, said: str, *, passes: bool = False) -> None:
+    def _tell(self, kind: str, message: str, *, passes: bool = False) -> None:
         """Say once for each kind what the provider said, without the key. passes: whether another try may help."""
         if kind not in self._told:
             self._told.add(kind)
-            said = redact(" ".join(said.split()))  # before it is cut
+            message = redact(" ".join(message.split()))  # before it is cut
             happened = _HAPPENED.get(kind, "a call failed")
             again = "; a run tries again" if passes else ""
-            progress.current().note(f"{self._entry.id}: {happened}{again} ({kind}: {plain(said)[:300]})")
+            progress.current().note(f"{self._entry.id}: {happened}{again} ({kind}: {plain(message)[:300]})")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

@@ -59,15 +59,15 @@ class Settled(Generic[AnyCell, AnyCall]):
     tally: Tally
 
     def answered(self) -> Iterator[tuple[AnyCall, Row]]:
-        """Each call with its row of the ledger."""
+        """Return each call with its row of the ledger."""
         return ((call, self.rows[call.request.key]) for call in self.calls)
 
     def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
-        """The cell and its table, a row a call, with how the calls went."""
+        """Return the cell and its table, a row a call, with how the calls went."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
         counts = {"wanted": len(self.rows), "known": self.tally.cached, "asked": self.tally.asked}
-        shown = {**counts, "failed": self.tally.errors, "dollars": round(dollars, 6)}
-        return self.cell, StageOutput([row_of(self.cell, *pair) for pair in self.answered()], self.tally, shown)
+        figures = {**counts, "failed": self.tally.errors, "dollars": round(dollars, 6)}
+        return self.cell, StageOutput([row_of(self.cell, *pair) for pair in self.answered()], self.tally, figures)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class _Asking:
         return True
 
     def halted(self) -> bool:
-        """Whether no more calls are to be sent."""
+        """Return whether no more calls are to be sent."""
         return self.stop.is_set() or bool(self.problems)
 
     async def sync(self) -> None:
@@ -215,10 +215,10 @@ async def settle_evaluation(
     Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
     cells share (a steered control stands in two datasets) is found by the second.
     """
-    told = set[str]()
+    reported = set[str]()
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
         for cell in cells:
-            settled = await _settle_cell(work, cell, _Evaluation(writer, told), stop)
+            settled = await _settle_cell(work, cell, _Evaluation(writer, reported), stop)
             if settled is None:
                 return  # what was answered is in the ledger
             yield settled
@@ -232,25 +232,25 @@ async def _settle_cell(
     """Ask what is missing of a cell; None if that was stopped."""
     report = progress.current()
     calls = work.calls(cell)
-    wanted = {call.request.key: call.request for call in calls}
-    known = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, wanted)
+    requests = {call.request.key: call.request for call in calls}
+    known = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
     for place in sorted({*known.notes} - its.told):
         report.note(f"{place}: {known.notes[place]}")
     its.told.update(known.notes)
     rows = {key: _Held(row) for key, row in known.settled.items()}
-    missing = [request for key, request in wanted.items() if key not in rows]
+    missing = [request for key, request in requests.items() if key not in rows]
     new = Counter(request.participant for request in missing)
-    counts = Counter(request.participant for request in wanted.values())
+    counts = Counter(request.participant for request in requests.values())
     report.asking(work.stage, {name: (new[name], count - new[name]) for name, count in counts.items()})
     asking = _Asking(work, its.writer, missing, stop)
     await asking.run()
     rows |= asking.rows
-    if stop.is_set() or len(rows) < len(wanted):
+    if stop.is_set() or len(rows) < len(requests):
         return None
     await its.writer.sync()
     errors = sum(not settles(row) for row in rows.values())
-    tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
-    return Settled(cell, calls, {key: rows[key] for key in wanted}, tally)
+    tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
+    return Settled(cell, calls, {key: rows[key] for key in requests}, tally)
 
 
 async def settle(
@@ -258,7 +258,7 @@ async def settle(
 ) -> AsyncIterator[Settled[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models side by side. A model that fails yields its exception; the others go on."""
     done: asyncio.Queue[Settled[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
-    taken = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
+    turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
         try:
@@ -266,7 +266,7 @@ async def settle(
                 if stop.is_set():
                     return
                 async for settled in settle_evaluation(work, evaluation, mine, stop):
-                    await taken.acquire()
+                    await turn.acquire()
                     done.put_nowait(settled)
                     del settled
         except LockGivenUp:
@@ -290,7 +290,7 @@ async def settle(
             else:
                 yield settled
                 if isinstance(settled, Settled):
-                    taken.release()
+                    turn.release()
     finally:
         for task in tasks:
             task.cancel()

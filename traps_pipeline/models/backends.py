@@ -9,7 +9,7 @@ from traps_pipeline.models.request import Backend
 
 
 def require_libraries(entry: Entry) -> None:
-    """Raises TrapsError with the line to type unless what this entry is asked through is installed."""
+    """Raise TrapsError with the line to type unless what this entry is asked through is installed."""
     if entry.backend == NETWORK:
         require("api")
     if entry.backend == LOCAL:
@@ -19,7 +19,7 @@ def require_libraries(entry: Entry) -> None:
 
 
 def make_backend(entry: Entry) -> Backend:
-    """The entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
+    """Return the entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
 
     Raises TrapsError when its library is not installed, its key is not set, or its weights are not here.
     """

@@ -38,7 +38,7 @@ class Tokens:
 
 
 def most_tokens(entry: Entry, request: Request) -> Tokens:
-    """An upper bound of what a call takes."""
+    """Return an upper bound of what a call takes."""
     frames = request.sent.n_frames if request.sent else 0
     each = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
     schema = json.dumps(request.params.get("response_format", ""))
@@ -47,7 +47,7 @@ def most_tokens(entry: Entry, request: Request) -> Tokens:
 
 
 def worst_case_usd(entry: Entry, request: Request) -> float:
-    """Dollars that a call may cost at most; 0 where the price is unknown (a study must allow that)."""
+    """Return dollars that a call may cost at most; 0 where the price is unknown (a study must allow that)."""
     if entry.prices is None:
         return 0.0
     tokens = most_tokens(entry, request)
@@ -55,7 +55,7 @@ def worst_case_usd(entry: Entry, request: Request) -> float:
 
 
 def check_money(study: Study, entry: Entry) -> None:
-    """Raises TrapsError unless the study allows what asking this participant may cost."""
+    """Raise TrapsError unless the study allows what asking this participant may cost."""
     if entry.backend != NETWORK:
         return
     if entry.prices is None:

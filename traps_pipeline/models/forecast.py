@@ -46,7 +46,7 @@ class Forecast:
 
 
 def experience(totals: Iterable[Totals]) -> Experience:
-    """What the ledgers' rows of one participant say."""
+    """Return what the ledgers' rows of one participant say."""
     joined = Totals()
     for part in totals:
         joined.join(part)
@@ -54,7 +54,9 @@ def experience(totals: Iterable[Totals]) -> Experience:
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
-    """What so many new calls to an entry take. The high end is each call's worst case, which a budget reserves."""
+    """Return what so many new calls to an entry take. The high end is each call's worst case, which a budget
+    reserves.
+    """
     frames, most_frames = _clip_tokens(entry)
     prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
     completion = seen.completion_tokens or entry.expected_completion_tokens
@@ -84,8 +86,8 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
-    """Minutes of calls that are made side by side: those of the slowest participant, or of the account whose pace its
-    participants share."""
+    """Return minutes of calls that are made side by side: those of the slowest participant, or of the account whose
+    pace its participants share."""
     rows, shared = list(forecasts), dict[str, float]()
     for row in rows:
         shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes

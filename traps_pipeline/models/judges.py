@@ -126,9 +126,9 @@ class JudgeEntry(Entry):
 @own.keeps
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
-    """Judges by id. Raises TrapsError naming judge and field."""
-    found = read_entries(path, "judges", JudgeEntry)
-    return with_own(found, "judges", JudgeEntry) if path == JUDGES_FILE else found
+    """Return judges by id. Raises TrapsError naming judge and field."""
+    judges = read_entries(path, "judges", JudgeEntry)
+    return with_own(judges, "judges", JudgeEntry) if path == JUDGES_FILE else judges
 
 
 def thinking_of(judge: str) -> Marks | None:
@@ -140,15 +140,15 @@ def thinking_of(judge: str) -> Marks | None:
 @own.keeps
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
-    """The judges of a panel: three, or one. Raises TrapsError naming the file and what is wrong."""
+    """Return the judges of a panel: three, or one. Raises TrapsError naming the file and what is wrong."""
     panels, judges = load_panels(path), load_judges(path)
     if not name:
         raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
     if name not in panels:
         raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
-    whole = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
-    if not whole or any(seat not in judges for seat in seats):
+    is_valid = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
+    if not is_valid or any(seat not in judges for seat in seats):
         sizes = " or ".join(map(str, PANEL_SIZES))
         raise TrapsError(f"{path}: panel {name!r} must seat {sizes} different known judges, not {seats}")
     if name != RULES_PANEL and any(judges[seat].backend == RULE for seat in seats):
@@ -157,7 +157,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
-    """The seats of every panel by name, unchecked. Raises TrapsError if the file has no mapping `panels:`."""
+    """Return the seats of every panel by name, unchecked. Raises TrapsError if the file has no mapping `panels:`."""
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
@@ -165,7 +165,7 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
 
 
 def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
-    """What to do where no panel is named, in words."""
+    """Return what to do where no panel is named, in words."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
         f"({RULES_PANEL} is for reference models)"
@@ -173,7 +173,7 @@ def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
 
 
 def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
-    """Raises TrapsError where no panel is named, where it is unknown, and where rules would judge other models than
+    """Raise TrapsError where no panel is named, where it is unknown, and where rules would judge other models than
     reference models although nobody said so."""
     load_panel(panel)
     others = [model for model in models if not is_reference(model)]
@@ -187,12 +187,12 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 
 def panel_version(panel: str) -> str:
-    """Version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
+    """Return version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
     return version_of_seats(load_panel(panel)) if panel else "no panel is named"
 
 
 def version_of_seats(seats: Iterable[Judge]) -> str:
-    """Version of what these judges decide."""
+    """Return version of what these judges decide."""
     judges = list[list[Any]]()
     for seat in seats:
         more = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []
@@ -201,21 +201,21 @@ def version_of_seats(seats: Iterable[Judge]) -> str:
 
 
 def panel_id(panel: str) -> str:
-    """What stands for a panel in the rows that it decided: its name and the version of its judges, and a mark where it
-    is a single judge."""
+    """Return what stands for a panel in the rows that it decided: its name and the version of its judges, and a mark
+    where it is a single judge."""
     return id_of_seats(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
 
 
 def id_of_seats(name: str, seats: Sequence[Judge]) -> str:
-    """What stands for a panel of this name and these judges."""
+    """Return what stands for a panel of this name and these judges."""
     return f"{name}@{version_of_seats(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
 
 
 def panel_names(panels: str) -> list[str]:
-    """The names of the panels in a column of joined panel ids."""
+    """Return the names of the panels in a column of joined panel ids."""
     return [one.partition("@")[0] for one in panels.split("+") if one]
 
 
 def by_rules(panels: str, model: str) -> bool:
-    """Whether rules judged a model that they are not made for, by the column `panel` of a row."""
+    """Return whether rules judged a model that they are not made for, by the column `panel` of a row."""
     return RULES_PANEL in panel_names(panels) and not is_reference(model)

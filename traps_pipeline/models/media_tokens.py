@@ -21,8 +21,8 @@ STAMP = 8  # Qwen3-VL: the time before two frames, and the marks around them
 
 
 def openai_frame(model: str, size: Size) -> float | None:
-    """An image at detail auto or high: tiles of 512 pixels, or patches of 32, by the model; None for a model that is
-    not OpenAI's. Frames are small enough not to be scaled down, and are not enlarged.
+    """Return an image at detail auto or high: tiles of 512 pixels, or patches of 32, by the model; None for a model
+    that is not OpenAI's. Frames are small enough not to be scaled down, and are not enlarged.
 
     https://platform.openai.com/docs/guides/images-vision (calculating costs). It says 1.62 tokens a patch of
     gpt-5-mini; 1.20 were measured at the API with six sizes (OpenAI Developer Community, "GPT-5-mini image input token
@@ -39,7 +39,7 @@ def openai_frame(model: str, size: Size) -> float | None:
 
 
 def gemini_frame(model: str, size: Size, profile: Profile) -> float:
-    """A frame that Gemini samples of a video, or an image, at the default media resolution.
+    """Return a frame that Gemini samples of a video, or an image, at the default media resolution.
 
     Up to Gemini 2.5: 258 tokens a frame (that is 258 a second at one frame a second), and 258 an image of at most 384
     pixels, or each tile of 768 (https://ai.google.dev/gemini-api/docs/tokens). Gemini 3: 70 a frame and 1,120 an image
@@ -52,14 +52,14 @@ def gemini_frame(model: str, size: Size, profile: Profile) -> float:
 
 
 def anthropic_frame(size: Size) -> float:
-    """An image of at most 1,568 pixels on its long edge: its area by 750
+    """Return an image of at most 1,568 pixels on its long edge: its area by 750
     (https://docs.anthropic.com/en/docs/build-with-claude/vision)."""
     return size[0] * size[1] / 750
 
 
 def qwen3_vl_frame(size: Size, profile: Profile) -> float:
-    """Cells of 32 pixels, whole in each direction; two frames of a video share theirs and have a time before them (the
-    model's own processor, as transformers has it)."""
+    """Return cells of 32 pixels, whole in each direction; two frames of a video share theirs and have a time before
+    them (the model's own processor, as transformers has it)."""
     cells = round(size[0] / 32) * round(size[1] / 32)
     return (cells + STAMP) / 2 if profile == "video" else cells + 2
 
@@ -77,5 +77,5 @@ def expected_clip_tokens(entry: ModelEntry) -> float:
         "vertex_ai": lambda: gemini_frame(model, size, media.profile),
         "anthropic": lambda: anthropic_frame(size),
     }
-    found = qwen3_vl_frame(size, media.profile) if "qwen3-vl" in model.lower() else counts.get(route, lambda: None)()
-    return (media.uniform or media.most) * (entry.tokens_per_frame if found is None else found)
+    count = qwen3_vl_frame(size, media.profile) if "qwen3-vl" in model.lower() else counts.get(route, lambda: None)()
+    return (media.uniform or media.most) * (entry.tokens_per_frame if count is None else count)

@@ -15,7 +15,7 @@ from traps_pipeline.video.policies import FramePolicy
 
 @lru_cache(maxsize=100_000)
 def seen(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
-    """What the observer says of these frames of a clip; one look serves all regimes and runs."""
+    """Return what the observer says of these frames of a clip; one look serves all regimes and runs."""
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question, frames)
@@ -25,7 +25,7 @@ class ObserverBackend:
     """Looks at the clip with classical vision; sees neither the record nor the simulator."""
 
     async def ask(self, request: Request) -> Outcome:
-        """One attempt; see `Backend`."""
+        """Return one attempt; see `Backend`."""
         assert request.media is not None, "the observer is asked about clips"
         frames = observed(dataset_of(str(request.about["item_id"])))
         answer = await asyncio.to_thread(seen, request.media_digest, request.media, request.user, frames)

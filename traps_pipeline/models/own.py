@@ -49,7 +49,7 @@ class Own(BaseModel):
         return values
 
     def __or__(self, newer: Own) -> Own:
-        """These, with the newer entries in the place of those of the same name."""
+        """Return these, with the newer entries in the place of those of the same name."""
 
         def entries(kind: Kind) -> list[dict[str, Any]]:
             return [*{entry["id"]: entry for own in (self, newer) for entry in getattr(own, kind)}.values()]
@@ -65,8 +65,8 @@ class Own(BaseModel):
     def all_accounts(self) -> dict[str, dict[str, Any]]:
         """The accounts, with one for each entry that has an address of its own."""
         short = [entry for entry in (*self.models, *self.judges) if "base_url" in entry]
-        made = {_account(entry): {k: entry[k] for k in ("base_url", "key") if k in entry} for entry in short}
-        return self.accounts | made
+        accounts = {_account(entry): {k: entry[k] for k in ("base_url", "key") if k in entry} for entry in short}
+        return self.accounts | accounts
 
 
 _overlay: list[tuple[Path, Own]] = []  # of the experiment that a command names
@@ -93,35 +93,36 @@ def use(own: Own, path: Path) -> None:
 
 def keep(workspace: Workspace) -> None:
     """Write what the experiment brought into the workspace, where every run reads it, whoever starts it."""
-    brought = [own for _, own in _overlay if own != Own()]
-    if brought:
+    additions = [own for _, own in _overlay if own != Own()]
+    if additions:
         path = Workspace.file_of(workspace.place, FILE)
-        together = (_read(path) if path else Own()) | brought[-1]
+        together = (_read(path) if path else Own()) | additions[-1]
         workspace.store.write({workspace.root / FILE: _yaml(together).encode()})
         forget()
 
 
 def sources() -> list[tuple[Path, Own]]:
-    """What is added to the registries, each with the file that brings it: the workspace's, then the experiment's."""
+    """Return what is added to the registries, each with the file that brings it: the workspace's, then the
+    experiment's."""
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
 
 def together() -> Own:
-    """All of `sources` in one."""
-    whole = Own()
+    """Return all of `sources` in one."""
+    combined = Own()
     for _, own in sources():
-        whole |= own
-    return whole
+        combined |= own
+    return combined
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
-    """All accounts that are added."""
+    """Return all accounts that are added."""
     return together().all_accounts
 
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
-    """Models or judges that are added, written out in full, each with its file."""
+    """Return models or judges that are added, written out in full, each with its file."""
     newest = {raw["id"]: (path, raw) for path, own in sources() for raw in getattr(own, kind)}
     return ((path, _whole(raw, kind)) for path, raw in newest.values())
 
@@ -145,7 +146,7 @@ def _account(entry: Mapping[str, Any]) -> str:
 
 
 def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
-    """An entry with all fields that a registry's has, from one that may be short."""
+    """Return an entry with all fields that a registry's has, from one that may be short."""
     entry = {name: value for name, value in raw.items() if name not in SHORT}
     if "base_url" not in raw:
         return entry
@@ -179,7 +180,7 @@ def _media(media: Any) -> Any:
 
 
 def _is_here(address: str) -> bool:
-    """Whether an address is this machine's, where nobody sends a bill."""
+    """Return whether an address is this machine's, where nobody sends a bill."""
     host = urlsplit(address).hostname or ""
     try:
         return ip_address(host).is_loopback

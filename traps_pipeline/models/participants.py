@@ -53,16 +53,16 @@ class Participant:
     breaker: Breaker
 
 
-def allow_connections(wanted: int) -> None:
+def allow_connections(count: int) -> None:
     """Let this process hold so many connections open besides its files. Raises TrapsError where the shell does not
     allow it: an answer that is paid for could not be stored."""
-    needed = wanted + FILES
+    needed = count + FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
         return
     if hard != resource.RLIM_INFINITY and hard < needed:
         raise TrapsError(
-            f"{wanted} connections at once need {needed} open files, and this shell allows {hard}: raise that "
+            f"{count} connections at once need {needed} open files, and this shell allows {hard}: raise that "
             f"(`ulimit -n {needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
         )
     resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
@@ -126,7 +126,7 @@ class Allowed:
 
 
 async def attempt(participant: Participant, request: Request, allowed: Allowed) -> tuple[Outcome, int, float] | None:
-    """An outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
+    """Return an outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
 
     The one retry layer: exponential with full jitter, and never sooner than the provider asks. The outcome's cost holds
     what attempts before it may have cost.
@@ -175,7 +175,8 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
 def _given_up(
     kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
 ) -> tuple[Outcome, int, float] | None:
-    """A failure for the ledger; None for a call that was never sent, or that cost nothing and will be made again."""
+    """Return a failure for the ledger; None for a call that was never sent, or that cost nothing and will be made
+    again."""
     if kind in ("interrupted", "budget") and not lost_usd:
         return None
     if kind == MALFORMED:
@@ -184,7 +185,8 @@ def _given_up(
 
 
 async def _send(participant: Participant, request: Request, allowed: Allowed) -> Outcome:
-    """One attempt under a reservation. Raises TransientError and BudgetReached, and TrapsError before it is sent.
+    """Return one attempt under a reservation. Raises TransientError and BudgetReached, and TrapsError before it is
+    sent.
 
     A call costs its worst case from the moment that bytes of it are handed to a server until the provider says
     otherwise, and in a way that can be believed: one that timed out may be billed. One that never left costs nothing.
@@ -222,9 +224,9 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:
-    """A cost that a backend read of an answer; the worst case where it is unknown or cannot be. A provider that did
-    not hold to the limits of a call is believed to have charged for more, up to a bound: a number of tokens that nobody
-    can have made would else end the study."""
+    """Return a cost that a backend read of an answer; the worst case where it is unknown or cannot be. A provider that
+    did not hold to the limits of a call is believed to have charged for more, up to a bound: a number of tokens that
+    nobody can have made would else end the study."""
     if cost_usd is None or not math.isfinite(cost_usd) or cost_usd < 0:
         return worst_usd
     return min(cost_usd, OVERRUN * worst_usd)
@@ -239,7 +241,8 @@ async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
 def ledger_row(
     request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
 ) -> tuple[Row, dict[str, str]]:
-    """The row that stands for an answer, and what is kept beside it: its reasoning trace, an answer out of order."""
+    """Return the row that stands for an answer, and what is kept beside it: its reasoning trace, an answer out of
+    order."""
     fields = asdict(outcome)
     beside = {name: text for name in ASIDES if (text := fields.pop(name)) is not None}
     row = {
@@ -254,5 +257,5 @@ def ledger_row(
 
 
 def when_asked(row: Row) -> Row:
-    """The columns of every table made from a ledger that say when a row's call was asked."""
+    """Return the columns of every table made from a ledger that say when a row's call was asked."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

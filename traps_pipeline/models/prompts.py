@@ -20,7 +20,7 @@ _SCHEMA_PARTS = {
 
 @cache
 def prompt(name: str) -> str:
-    """Text of `assets/prompts/<name>.txt`, stripped."""
+    """Return text of `assets/prompts/<name>.txt`, stripped."""
     path = PROMPTS / f"{name}.txt"
     try:
         text = path.read_text(encoding="utf-8").strip()
@@ -33,24 +33,24 @@ def prompt(name: str) -> str:
 
 @cache
 def system_prompt(regime: str, dataset: str = "") -> str:
-    """The regime's system prompt, in a dataset that may vary it: parts stripped and joined by one blank line."""
+    """Return the regime's system prompt, in a dataset that may vary it: parts stripped and joined by one blank line."""
     varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
     return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *varied))
 
 
 @cache
 def vqa_prompt(name: str) -> str:
-    """The system prompt under which hidden states are extracted, for one of VQA_PROMPTS (docs/spec.md 7.1)."""
+    """Return the system prompt under which hidden states are extracted, for one of VQA_PROMPTS (docs/spec.md 7.1)."""
     return "\n\n".join(prompt(part) for part in BY_NAME[name].states)
 
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
-    """Version of a regime's system prompt, and of its variations in those datasets that have one."""
+    """Return version of a regime's system prompt, and of its variations in those datasets that have one."""
     varied = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
     return digest([system_prompt(regime), *varied] if varied else system_prompt(regime))[:16]
 
 
 def states_prompt(system: str, name: str) -> str:
-    """The system prompt under which states are read: the VQA prompt of that name, or the benchmark's own (system
+    """Return the system prompt under which states are read: the VQA prompt of that name, or the benchmark's own (system
     `benchmark`)."""
     return system_prompt(name) if system == "benchmark" else vqa_prompt(name)

@@ -125,7 +125,7 @@ def _skip(text: str, place: int, sign: str = "") -> int:
 
 
 def degenerate(text: str) -> str | None:
-    """Why a text says nothing: it holds no letter and no digit, or repeats itself; None if it says something.
+    """Return why a text says nothing: it holds no letter and no digit, or repeats itself; None if it says something.
 
     A text repeats itself where a unit of at most 40 words stands at least six times in a row at its end and makes up
     at least half of its words, or where 30 characters or more are of at most two kinds.
@@ -148,8 +148,8 @@ def degenerate(text: str) -> str | None:
 
 
 def _is_json(text: str, fields: Sequence[str]) -> bool:
-    """Whether a text is an object with the fields that decide, `final_answer` and `abstain` if asked for, in a fence or
-    not. What reasons it gives is left to it."""
+    """Return whether a text is an object with the fields that decide, `final_answer` and `abstain` if asked for, in a
+    fence or not. What reasons it gives is left to it."""
     try:
         parsed = json.loads(strip_fence(text))
     except (ValueError, RecursionError):

@@ -22,12 +22,12 @@ Strategy = Callable[[Request], str | None]  # the label answered, None for an ab
 
 
 def uniform(request: Request, purpose: str) -> float:
-    """A number in [0, 1) that depends on the request's key and the purpose alone."""
+    """Return a number in [0, 1) that depends on the request's key and the purpose alone."""
     return int(digest([request.key, purpose])[:13], 16) / 16**13
 
 
 def _truth(request: Request) -> str:
-    """The right answer on a control; on a void, where there is none, a guess."""
+    """Return the right answer on a control; on a void, where there is none, a guess."""
     secret = request.secret
     if secret["side"] == "control":
         return secret["ground_truth"]
@@ -56,14 +56,14 @@ STRATEGIES: Mapping[str, Strategy] = {
 
 
 def phrase(answer: str | None, request: Request) -> str:
-    """The answer in the words of a model that is asked in this way."""
+    """Return the answer in the words of a model that is asked in this way."""
     if answer is None:
         reason, final = "The clip does not show what decides the outcome.", ABSTENTION
     else:
         reason, final = "I followed the motion to the end of the clip.", answer
     if fields := fields_of(str(request.about["regime"]), dataset_of(str(request.about["item_id"]))):
-        said = {"reason": reason, "abstain": answer is None, "final_answer": final}
-        return json.dumps({name: said[name] for name in fields})
+        answer_object = {"reason": reason, "abstain": answer is None, "final_answer": final}
+        return json.dumps({name: answer_object[name] for name in fields})
     return f"{reason} {ABSTENTION}." if answer is None else f"{reason} The answer is: {final}."
 
 
@@ -74,7 +74,7 @@ class ReferenceBackend:
         self._attempts: Counter[str] = Counter()
 
     async def ask(self, request: Request) -> Outcome:
-        """One attempt; see `Backend`."""
+        """Return one attempt; see `Backend`."""
         await asyncio.sleep(0)
         misfortune = self._misfortune(request)
         if misfortune is not None:
@@ -83,7 +83,8 @@ class ReferenceBackend:
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
 
     def _misfortune(self, request: Request) -> Outcome | None:
-        """What the `faults` shares (empty, refused, failing, transient) make of this request; None for an answer."""
+        """Return what the `faults` shares (empty, refused, failing, transient) make of this request; None for an
+        answer."""
         faults: Mapping[str, Any] = request.params.get("faults", {})
         if not faults:
             return None

@@ -49,7 +49,8 @@ LOCAL_TIMEOUT_S = 24 * 3600.0
 
 
 def structured(name: str, **properties: Any) -> dict[str, Any]:
-    """The `response_format` of an object with exactly these properties (JSON schema of each), all of them required."""
+    """Return the `response_format` of an object with exactly these properties (JSON schema of each), all of them
+    required."""
     schema = {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
     return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": schema}}
 
@@ -58,7 +59,7 @@ _TYPES = {"reason": "string", "abstain": "boolean", "final_answer": "string"}
 
 
 def answer_object(fields: Iterable[str]) -> dict[str, Any]:
-    """The `response_format` of an answer with these fields (`regimes.FIELDS`)."""
+    """Return the `response_format` of an answer with these fields (`regimes.FIELDS`)."""
     return structured("answer", **{name: {"type": _TYPES[name]} for name in fields})
 
 
@@ -104,7 +105,7 @@ class Prices(BaseModel):
     as_of: datetime.date
 
     def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
-        """Dollars for a call."""
+        """Return dollars for a call."""
         return (prompt_tokens * self.input + completion_tokens * self.output) / 1e6
 
 
@@ -179,7 +180,7 @@ class Entry(BaseModel):
         return int(self.params.get("max_tokens") or self.params.get("max_completion_tokens") or 0)
 
     def protocol(self) -> Protocol:
-        """What the protocol sends to such a participant: parameter to its names and its value."""
+        """Return what the protocol sends to such a participant: parameter to its names and its value."""
         return PROTOCOL
 
     def _check_waivers(self, protocol: Protocol) -> None:
@@ -191,9 +192,9 @@ class Entry(BaseModel):
             elif len(sent) > 1:
                 raise ValueError(f"params: {' and '.join(names)} are two names of one parameter: send one of them")
             elif parameter not in self.waivers:
-                found = f"is {sent[0]!r}" if sent else "is not sent"
+                problem = f"is {sent[0]!r}" if sent else "is not sent"
                 raise ValueError(
-                    f"params.{parameter} {found}, the protocol has {value!r}: send that, or say why under waivers"
+                    f"params.{parameter} {problem}, the protocol has {value!r}: send that, or say why under waivers"
                 )
         known = (*protocol, *OTHER_WAIVERS)
         for parameter in self.waivers.keys() - set(known):
@@ -258,11 +259,11 @@ class ModelEntry(Entry):
             raise ValueError("device, mechanism, size: only backend local has them")
 
     def local_params(self) -> LocalParams:
-        """`params` of backend local, checked. Raises pydantic's ValidationError."""
+        """Return `params` of backend local, checked. Raises pydantic's ValidationError."""
         return LocalParams.model_validate(self.params)
 
     def inside_params(self) -> LocalParams:
-        """The parameters that the model is looked into with: those of `params`, or as `mechanism` has it."""
+        """Return the parameters that the model is looked into with: those of `params`, or as `mechanism` has it."""
         params = self.local_params()
         return self.mechanism.inside(params) if self.mechanism else params
 
@@ -277,7 +278,7 @@ _Entry = TypeVar("_Entry", bound=Entry)
 
 
 def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
-    """Entries of a registry file by id, in file order. Raises TrapsError naming entry and field."""
+    """Return entries of a registry file by id, in file order. Raises TrapsError naming entry and field."""
     data = read_yaml(path)
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list):
@@ -290,7 +291,7 @@ def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
 
 
 def _add(
-    found: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
+    entries: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
 ) -> None:
     name = raw.get("id", "?") if isinstance(raw, dict) else "?"
     short = [field for field in own.SHORT if isinstance(raw, dict) and field in raw]
@@ -300,31 +301,31 @@ def _add(
             "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
         )
     entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context)
-    if entry.id in found:
+    if entry.id in entries:
         raise TrapsError(f"{path}: {what}: id {entry.id!r} occurs twice, here or in {MODELS_FILE.parent}")
-    found[entry.id] = entry
+    entries[entry.id] = entry
 
 
-def with_own(found: dict[str, _Entry], key: own.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
-    """Entries of a registry, followed by those that the experiment and the workspace add."""
+def with_own(entries: dict[str, _Entry], key: own.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
+    """Return entries of a registry, followed by those that the experiment and the workspace add."""
     context = {"accounts": load_accounts()}
     for path, raw in own.entries(key):
-        _add(found, kind, raw, path, f"own {key.rstrip('s')}", context)
-    return found
+        _add(entries, kind, raw, path, f"own {key.rstrip('s')}", context)
+    return entries
 
 
 @own.keeps
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
-    """Models by id, in file order. Raises TrapsError naming entry and field."""
-    found = read_entries(path, "models", ModelEntry)
-    return with_own(found, "models", ModelEntry) if path == MODELS_FILE else found
+    """Return models by id, in file order. Raises TrapsError naming entry and field."""
+    models = read_entries(path, "models", ModelEntry)
+    return with_own(models, "models", ModelEntry) if path == MODELS_FILE else models
 
 
 @own.keeps
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
-    """Accounts by name. Raises TrapsError naming account and field."""
+    """Return accounts by name. Raises TrapsError naming account and field."""
     data = read_yaml(path)
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
@@ -335,13 +336,14 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
 
 
 def account_of(entry: Entry) -> Account:
-    """The account that a network entry is asked through."""
+    """Return the account that a network entry is asked through."""
     return load_accounts()[str(entry.account)]
 
 
 def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[str, Any]:
-    """What is sent under a regime, in a dataset that may vary it: the entry's parameters, the schema of the object that
-    is asked for where the entry has it, and of a checkpoint the digest of its weights (`declared_digest`)."""
+    """Return what is sent under a regime, in a dataset that may vary it: the entry's parameters, the schema of the
+    object that is asked for where the entry has it, and of a checkpoint the digest of its weights (`declared_digest`).
+    """
     if entry.backend == LOCAL:
         from traps_pipeline.models.local.checkpoint import declared_digest
 
@@ -353,7 +355,7 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 
 
 def answering_version(evaluation: Evaluation) -> str:
-    """Version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
+    """Return version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
     entry = get_model(evaluation.model)
     sent: list[Any] = [effective_params(entry, evaluation.regime)]
     sent += [profile_digest(entry.media)] if entry.media else []
@@ -362,7 +364,7 @@ def answering_version(evaluation: Evaluation) -> str:
 
 
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
-    """Environment variables of keys that are not set: who needs them."""
+    """Return environment variables of keys that are not set: who needs them."""
     accounts = load_accounts()
     missing: dict[str, list[str]] = {}
     for entry in entries:
@@ -373,7 +375,7 @@ def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
 
 
 def get_model(model_id: str) -> ModelEntry:
-    """The entry of that id. Raises TrapsError with ids that are like it."""
+    """Return the entry of that id. Raises TrapsError with ids that are like it."""
     models = load_models()
     if model_id not in models:
         near = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
@@ -382,8 +384,8 @@ def get_model(model_id: str) -> ModelEntry:
 
 
 def is_reference(model_id: str) -> bool:
-    """Whether a model is one of the strategies, observers and rules that the rule judges are made for; on a board of
-    several submissions it may be named model@submission."""
+    """Return whether a model is one of the strategies, observers and rules that the rule judges are made for; on a
+    board of several submissions it may be named model@submission."""
     known, name = load_models(), model_id.partition("@")[0]
     return name in known and known[name].backend in ("reference", "observer", "rule")
 
@@ -391,5 +393,5 @@ def is_reference(model_id: str) -> bool:
 @own.keeps
 @cache
 def local_models() -> tuple[str, ...]:
-    """Models whose hidden states can be read, in file order."""
+    """Return models whose hidden states can be read, in file order."""
     return tuple(entry.id for entry in load_models().values() if entry.backend == LOCAL)

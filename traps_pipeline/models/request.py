@@ -125,5 +125,5 @@ class Backend(Protocol):
     """Answers requests of one participant."""
 
     async def ask(self, request: Request) -> Outcome:
-        """One attempt. Raises TransientError when another try may help; any other failure is an Outcome."""
+        """Return one attempt. Raises TransientError when another try may help; any other failure is an Outcome."""
         ...

@@ -39,7 +39,7 @@ def _cut(media_digest: str, clip: Path) -> bool:
 
 
 def names_no_choices(question: str) -> bool:
-    """Whether a question puts nothing up for choice: it has no `or`."""
+    """Return whether a question puts nothing up for choice: it has no `or`."""
     return re.search(r"\bor\b", question) is None
 
 
@@ -56,7 +56,7 @@ class RuleBackend:
     """Plays the rule that `params.rule` names."""
 
     async def ask(self, request: Request) -> Outcome:
-        """One attempt; see `Backend`."""
+        """Return one attempt; see `Backend`."""
         assert request.media is not None, "a rule is asked about clips"
         answer = await asyncio.to_thread(_answer, request, request.media)
         text = phrase(answer, request)

@@ -86,7 +86,7 @@ class Meter:
         self._at = time.monotonic()
 
     def _shared(self) -> list[float | None]:
-        """The rates of this process, a second."""
+        """Return the rates of this process, a second."""
         return [None if rate is None else rate / self._sharers() for rate in self._rates]
 
     @staticmethod
@@ -97,8 +97,8 @@ class Meter:
         """Wait until one call of so many tokens may go out, or until nothing is to be sent any more. The bucket may go
         below zero: later calls wait longer."""
         until = time.monotonic() + self._take((1.0, float(tokens)))
-        while (left := until - time.monotonic()) > 0 and not halted():
-            await asyncio.sleep(min(left, LOOK_S))
+        while (remaining := until - time.monotonic()) > 0 and not halted():
+            await asyncio.sleep(min(remaining, LOOK_S))
 
     def _take(self, amounts: tuple[float, float]) -> float:
         """Take from the buckets; the seconds until they are at zero again."""
@@ -140,13 +140,13 @@ class Breaker:
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
-        """Raises Stopped for a participant that was stopped before (`remembering_stops`)."""
+        """Raise Stopped for a participant that was stopped before (`remembering_stops`)."""
         for stopped in _stopped:
             if self._participant in stopped:
                 raise Stopped(stopped[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raises Stopped after five calls in a row that never left, the first of them a while ago: a server that is
+        """Raise Stopped after five calls in a row that never left, the first of them a while ago: a server that is
         started again has that long. why: what kept the last one."""
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
@@ -159,8 +159,8 @@ class Breaker:
         self._unmade, self._unmade_since = 0, 0.0
 
     def watch(self, outcome: Outcome) -> None:
-        """Raises Stopped after 20 refusals of the same kind in a row, after three answers out of order in a row, or
-        when over 10 of the last 100 calls failed."""
+        """Raise Stopped after 20 refusals of the same kind in a row, after three answers out of order in a row, or when
+        over 10 of the last 100 calls failed."""
         refusal = _refusal(outcome)
         self._in_a_row = self._in_a_row + 1 if refusal and refusal == self._refusal else int(bool(refusal))
         self._refusal = refusal
@@ -178,17 +178,17 @@ class Breaker:
         self._stop(why)
 
     def _stop(self, why: str) -> NoReturn:
-        said = (
+        message = (
             f"{self._participant} is stopped: {why}; its answers so far are kept. Mend the cause and run the same "
             "command again: only what is missing is asked"
         )
         for stopped in _stopped:
-            stopped.setdefault(self._participant, said)  # calls in flight then come back later, and raise too
-        raise Stopped(said)
+            stopped.setdefault(self._participant, message)  # calls in flight then come back later, and raise too
+        raise Stopped(message)
 
 
 def _refusal(outcome: Outcome) -> str:
-    """The kind of a refusal by the provider (of the content, or of the call as it is); empty if it is none."""
+    """Return the kind of a refusal by the provider (of the content, or of the call as it is); empty if it is none."""
     if outcome.kind == "refused":
         return outcome.error or outcome.finish_reason or "refused"
     return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_") else ""

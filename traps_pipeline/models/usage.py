@@ -58,7 +58,7 @@ class Sizes:
     text_bytes: int
 
     def contradict(self, usage: Usage) -> bool:
-        """Whether a usage is below what this takes at the very least: no answer took nothing."""
+        """Return whether a usage is below what this takes at the very least: no answer took nothing."""
         least = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
         return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
 
@@ -87,24 +87,24 @@ def _at_least(fields: Mapping[str, Any]) -> Usage | None:
 def _whole(
     fields: Mapping[str, Any], prompt: str, completion: str, total: str | None, apart: Mapping[str, bool]
 ) -> Usage | None:
-    told = {name: fields[name] for name in (prompt, completion, total, *apart) if name and name in fields}
+    counts = {name: fields[name] for name in (prompt, completion, total, *apart) if name and name in fields}
     if prompt == "promptTokenCount":
-        told.setdefault(completion, 0)  # Gemini leaves it out where all was thought; its sum is always there
-        if total not in told:
+        counts.setdefault(completion, 0)  # Gemini leaves it out where all was thought; its sum is always there
+        if total not in counts:
             return None
     if prompt == "input_tokens":
-        told = {name: value for name, value in told.items() if not (name in apart and value is None)}
-    elif told.get(str(total), 0) is None:
-        del told[str(total)]
-    if completion not in told or not all(map(_is_count, told.values())):
+        counts = {name: value for name, value in counts.items() if not (name in apart and value is None)}
+    elif counts.get(str(total), 0) is None:
+        del counts[str(total)]
+    if completion not in counts or not all(map(_is_count, counts.values())):
         return None
-    asked = told[prompt] + sum(told.get(name, 0) for name, of_answer in apart.items() if not of_answer)
-    given = told[completion] + sum(told.get(name, 0) for name, of_answer in apart.items() if of_answer)
-    if total in told:
-        if told[total] < told[prompt] + told[completion]:
+    asked = counts[prompt] + sum(counts.get(name, 0) for name, of_answer in apart.items() if not of_answer)
+    completion_tokens = counts[completion] + sum(counts.get(name, 0) for name, of_answer in apart.items() if of_answer)
+    if total in counts:
+        if counts[total] < counts[prompt] + counts[completion]:
             return None
-        given = max(given, told[total] - asked)  # some tell their reasoning in the sum alone
-    return Usage(asked, given, _reasoning(fields, given))
+        completion_tokens = max(completion_tokens, counts[total] - asked)  # some tell their reasoning in the sum alone
+    return Usage(asked, completion_tokens, _reasoning(fields, completion_tokens))
 
 
 def _reasoning(fields: Mapping[str, Any], most: int) -> int | None:

@@ -43,7 +43,8 @@ Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and s
 def panel_errors(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """PANEL_ERRORS rows from HUMAN_LABELS rows, and VERDICTS rows of the panel; none where people labelled nothing."""
+    """Return PANEL_ERRORS rows from HUMAN_LABELS rows, and VERDICTS rows of the panel; none where people labelled
+    nothing."""
     rows = []
     if _is_labelled(labels):
         drawn = _drawn(verdicts, resamples, seed)
@@ -57,8 +58,8 @@ def panel_errors(
 def corrected(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """CORRECTED rows from the same: every model under every regime, judged and corrected in the same resamples as the
-    leaderboard's. There are none unless people labelled answers for both tasks, since PECS needs both."""
+    """Return CORRECTED rows from the same: every model under every regime, judged and corrected in the same resamples
+    as the leaderboard's. There are none unless people labelled answers for both tasks, since PECS needs both."""
     nothing = pd.DataFrame(columns=pd.Index(CORRECTED.names))
     if not _is_labelled(labels):
         return nothing
@@ -79,16 +80,16 @@ def corrected(
 
 
 def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.ndarray) -> np.ndarray:
-    """The true share behind a judged one, elementwise, within [0, 1]; NaN where the two errors leave nothing to tell
-    yes from no by (sensitivity + specificity is 1 or less)."""
+    """Return the true share behind a judged one, elementwise, within [0, 1]; NaN where the two errors leave nothing to
+    tell yes from no by (sensitivity + specificity is 1 or less)."""
     gain = sensitivity + specificity - 1
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.clip(np.where(gain > 1e-12, (share + specificity - 1) / gain, np.nan), 0.0, 1.0)
 
 
 def _corrected_ends(share: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """The ends of a corrected share, (2, draws), from those of the judged one, (2, draws), and of sensitivity and
-    specificity, (2, 2, draws): it rises with the share and with specificity, and falls with sensitivity."""
+    """Return the ends of a corrected share, (2, draws), from those of the judged one, (2, draws), and of sensitivity
+    and specificity, (2, 2, draws): it rises with the share and with specificity, and falls with sensitivity."""
     sensitivity, specificity = errors[:, 0], errors[:, 1]
     return rogan_gladen(share, sensitivity[::-1], specificity)
 
@@ -103,9 +104,9 @@ def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Drawn:
 
 
 def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
-    """Sensitivity and specificity of the panel on each task that people labelled, in every draw; NaN without a yes, or
-    a no, of people."""
-    found: dict[TaskName, np.ndarray] = {}
+    """Return sensitivity and specificity of the panel on each task that people labelled, in every draw; NaN without a
+    yes, or a no, of people."""
+    errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
         answers = truths(labels, task).dropna(subset=["truth"])
         if answers.empty:
@@ -120,8 +121,8 @@ def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
             np.add.at(by_scenario[:, 0], ids.get_indexer(pd.Index(answers["scenario_id"][here])), counts[here])
             total = total + resampled_sums(weights, by_scenario)[0]
             having = having + (by_scenario[:, 0, 1::2] > 0).sum(axis=0)
-        found[task] = shares_of(with_unseen(total, having, drawn.unseen(task, len(having))))
-    return found
+        errors[task] = shares_of(with_unseen(total, having, drawn.unseen(task, len(having))))
+    return errors
 
 
 def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: str) -> dict[str, Any]:
@@ -145,7 +146,7 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
 
 
 def _entry(group: pd.DataFrame, named: str, drawn: Drawn, errors: Errors) -> dict[str, dict[str, float]]:
-    """The figures of one model and regime, judged and corrected, by dataset."""
+    """Return the figures of one model and regime, judged and corrected, by dataset."""
 
     def right(sums: np.ndarray, in_mean: bool) -> np.ndarray:
         shares = shares_of(sums, in_mean)
@@ -162,7 +163,7 @@ def _entry(group: pd.DataFrame, named: str, drawn: Drawn, errors: Errors) -> dic
 
 
 def _runs(group: pd.DataFrame, dataset: str) -> int:
-    """How many runs of a model and regime are behind its row of a dataset, or `overall`: those with all four."""
+    """Return how many runs of a model and regime are behind its row of a dataset, or `overall`: those with all four."""
     if dataset != "overall":
         return len(set(group["run"][group["dataset"] == dataset]))
     return sum(len(set(rows["dataset"])) == len(DATASETS) for _, rows in group.groupby("run"))

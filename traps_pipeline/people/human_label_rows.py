@@ -69,6 +69,6 @@ HUMAN_AGREEMENT = Table("human_agreement", HumanAgreementRow, partition_by=(), k
 
 
 def labels_version(folder: Path) -> str:
-    """A digest of the labels in a study's folder of labels."""
+    """Return a digest of the labels in a study's folder of labels."""
     path = folder / LABELS_FILE
     return file_digest(path)[:16] if path.is_file() else "not run"

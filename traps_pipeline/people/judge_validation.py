@@ -56,9 +56,9 @@ class HumanLabels:
 
 
 def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
-    """What an annotator is shown of each failure: sample_id, question, why_unanswerable, reasoning_trace (empty without
-    one) and response, in an order that reveals nothing. Raises TrapsError if no failure of the models to validate was
-    labelled, or if a failure's answer has been replaced."""
+    """Return what an annotator is shown of each failure: sample_id, question, why_unanswerable, reasoning_trace (empty
+    without one) and response, in an order that reveals nothing. Raises TrapsError if no failure of the models to
+    validate was labelled, or if a failure's answer has been replaced."""
     protocol = load_protocol()
     labels = _judged(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
@@ -69,7 +69,7 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
-    """The rows that an annotator fills in: SHEET_COLUMNS by failure, of `sheet_rows`, safe for a spreadsheet."""
+    """Return the rows that an annotator fills in: SHEET_COLUMNS by failure, of `sheet_rows`, safe for a spreadsheet."""
     empty = dict.fromkeys(LABEL_COLUMNS, "")
     return [
         empty | {name: str(no_formula(text)) for name, text in row.items()} | {"sample_id": row["sample_id"]}
@@ -98,7 +98,7 @@ def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> d
 
 
 def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
-    """The texts of an item's row; empty if there is no row."""
+    """Return the texts of an item's row; empty if there is no row."""
     rows = frame.loc[frame["item_id"] == item_id].to_dict("records")
     return {name: value for row in rows for name, value in row.items() if isinstance(value, str)}
 
@@ -115,11 +115,12 @@ def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence
 
 
 def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
-    """The labels of two annotators from a CSV file (LABEL_COLUMNS; others are ignored; true/false, yes/no or 1/0).
+    """Return the labels of two annotators from a CSV file (LABEL_COLUMNS; others are ignored; true/false, yes/no or
+    1/0).
 
     known: sample ids that the judge has labelled. Raises TrapsError naming the lines and columns that are wrong.
     """
-    found: dict[tuple[str, str], tuple[int, list[bool]]] = {}
+    labels: dict[tuple[str, str], tuple[int, list[bool]]] = {}
     wrong: list[str] = []
     for line, row in _lines(path):
         annotator, sample = row["annotator"], row["sample_id"]
@@ -131,16 +132,16 @@ def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
             for axis in AXES
             if row[axis].lower() not in (*YES_WORDS, *NO_WORDS)
         ]
-        if (annotator, sample) in found:
-            problems.append(f"{annotator:.40} has already labelled {sample:.40} on line {found[annotator, sample][0]}")
+        if (annotator, sample) in labels:
+            problems.append(f"{annotator:.40} has already labelled {sample:.40} on line {labels[annotator, sample][0]}")
         wrong += [f"{path}:{line}: {problem}" for problem in problems]
-        found.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
+        labels.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
     _refuse(wrong)
-    return _paired(path, found)
+    return _paired(path, labels)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """The rows of a CSV file with their line numbers, every LABEL_COLUMNS value a stripped text."""
+    """Yield the rows of a CSV file with their line numbers, every LABEL_COLUMNS value a stripped text."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.DictReader(stream)
@@ -154,17 +155,19 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         raise TrapsError(f"{path}: cannot be read as CSV ({error})") from error
 
 
-def _paired(path: Path, found: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
-    names = sorted({annotator for annotator, _ in found})
+def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
+    names = sorted({annotator for annotator, _ in by_sample})
     if len(names) != 2:
         raise TrapsError(
             f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
         )
     one, other = names
-    samples = sorted({sample for _, sample in found})
-    alone = [(a, s, line) for (a, s), (line, _) in found.items() if (other if a == one else one, s) not in found]
+    samples = sorted({sample for _, sample in by_sample})
+    alone = [
+        (a, s, line) for (a, s), (line, _) in by_sample.items() if (other if a == one else one, s) not in by_sample
+    ]
     _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
-    labels = np.array([[found[name, sample][1] for sample in samples] for name in names], bool)
+    labels = np.array([[by_sample[name, sample][1] for sample in samples] for name in names], bool)
     return HumanLabels((one, other), tuple(samples), labels)
 
 
@@ -178,8 +181,8 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
-    """JUDGE_VALIDATION rows from a label file, which are also written to the workspace. Raises TrapsError for a wrong
-    file, and for a study without labelled failures."""
+    """Return JUDGE_VALIDATION rows from a label file, which are also written to the workspace. Raises TrapsError for a
+    wrong file, and for a study without labelled failures."""
     judged = _judged(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
@@ -192,13 +195,13 @@ def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
 
 
 def _judged(workspace: Workspace) -> pd.DataFrame:
-    """The validly labelled failures."""
+    """Return the validly labelled failures."""
     labels = workspace.tables.read(CONFABULATION, {})
     return labels.loc[labels["valid"].to_numpy(bool)]
 
 
 def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
-    """JUDGE_VALIDATION rows of the judge's labels, (failures, axes) of bool, against both annotators'.
+    """Return JUDGE_VALIDATION rows of the judge's labels, (failures, axes) of bool, against both annotators'.
 
     Pooled labels are both annotators' labels side by side, without a consensus: 2 x failures per axis.
     """
@@ -242,7 +245,9 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
 
 
 def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether one class has at most 2 % of either annotator's labels: kappa then says nothing about agreement."""
+    """Return whether one class has at most 2 % of either annotator's labels: kappa then says nothing about
+    agreement.
+    """
     return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
 
 
@@ -267,12 +272,12 @@ def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
     return kappa, min(float(low), kappa), max(float(high), kappa)
 
 
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else np.nan
+def _share(part: int, total: int) -> float:
+    return part / total if total else np.nan
 
 
 def validation_text(rows: pd.DataFrame) -> str:
-    """JUDGE_VALIDATION rows as a person reads them."""
+    """Return JUDGE_VALIDATION rows as a person reads them."""
     first = rows.iloc[0]
     title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures"
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
@@ -285,7 +290,7 @@ def validation_text(rows: pd.DataFrame) -> str:
 
 
 def _kappa_cells(row: Mapping[Any, Any]) -> tuple[str, str]:
-    """Kappa, or why there is none, and its interval."""
+    """Return kappa, or why there is none, and its interval."""
     if pd.notna(row["kappa_note"]):
         return row["kappa_note"], ""
     if np.isnan(row["human_kappa"]):

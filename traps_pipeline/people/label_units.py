@@ -63,20 +63,20 @@ class AnnotationProtocol(BaseModel):
 
 @cache
 def annotation_protocol(path: Path = PROTOCOL_FILE) -> AnnotationProtocol:
-    """The protocol. Raises TrapsError naming the field that is wrong."""
+    """Return the protocol. Raises TrapsError naming the field that is wrong."""
     return parse_yaml_model(AnnotationProtocol, read_yaml(path), path)
 
 
 def units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """UNIT_COLUMNS of everything in the study that the task could label: panel is what the panel decided (null but in
-    ABOUT_ANSWERS), model, regime and run are null for clips. A study without such things gives no rows."""
+    """Return UNIT_COLUMNS of everything in the study that the task could label: panel is what the panel decided (null
+    but in ABOUT_ANSWERS), model, regime and run are null for clips. A study without such things gives no rows."""
     if task == "answerability":
-        found = _clips(workspace)
+        clips = _clips(workspace)
     elif task == "confabulation":
-        found = _failures(workspace)
+        clips = _failures(workspace)
     else:
-        found = _answers(workspace, task)
-    return found.reindex(columns=pd.Index(UNIT_COLUMNS)).reset_index(drop=True)
+        clips = _answers(workspace, task)
+    return clips.reindex(columns=pd.Index(UNIT_COLUMNS)).reset_index(drop=True)
 
 
 def _clips(workspace: Workspace) -> pd.DataFrame:
@@ -97,7 +97,7 @@ def _clips(workspace: Workspace) -> pd.DataFrame:
 
 
 def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """The answers whose abstention or correctness the study's panel decided."""
+    """Return the answers whose abstention or correctness the study's panel decided."""
     decision = "abstained" if task == "abstention" else "correct"
     verdicts = current(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
     decided = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
@@ -110,9 +110,9 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     rows = decided.merge(texts, on=_ANSWER, validate="one_to_one").merge(items, on="item_id", validate="many_to_one")
     panel = rows[decision].astype(bool)
     asked = ["question"] if task == "abstention" else ["question", "ground_truth"]
-    shown = rows[[*_ANSWER, *asked, "text"]].itertuples(index=False, name=None)
+    answers = rows[[*_ANSWER, *asked, "text"]].itertuples(index=False, name=None)
     return rows.assign(
-        unit=[_unit(task, *map(str, each)) for each in shown],
+        unit=[_unit(task, *map(str, each)) for each in answers],
         group=rows["side"] + np.where(panel, " yes", " no"),
         split=~rows["unanimous"].astype(bool),
         panel=panel,
@@ -120,7 +120,7 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 
 
 def _failures(workspace: Workspace) -> pd.DataFrame:
-    """The failures that the judge of confabulation labelled; `validation` samples them."""
+    """Return the failures that the judge of confabulation labelled; `validation` samples them."""
     rows = workspace.tables.read_all(CONFABULATION)
     judged = rows.loc[rows["valid"].astype(bool) & rows["model"].isin(load_protocol().validation.models)]
     scenarios = judged["item_id"].str.split(":").str[1]
@@ -132,44 +132,46 @@ def _unit(*shown: str) -> str:
 
 
 def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """The units that people are given, as `units` has them: `drawn` of each group, or the sheet's failures."""
-    whole = units(workspace, task)
-    if whole.empty:
-        return whole
+    """Return the units that people are given, as `units` has them: `drawn` of each group, or the sheet's failures."""
+    population = units(workspace, task)
+    if population.empty:
+        return population
     if task == "confabulation":
         chosen = {row["sample_id"] for row in sheet_rows(workspace)}
-        return whole.loc[whole["unit"].isin(sorted(chosen))].reset_index(drop=True)
+        return population.loc[population["unit"].isin(sorted(chosen))].reset_index(drop=True)
     protocol = annotation_protocol()
     size = getattr(protocol.sizes, task)
-    picked = [drawn_units(group, size, protocol) for _, group in whole.groupby("group", sort=True)]
+    picked = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]
     return pd.concat(picked, ignore_index=True)
 
 
 def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) -> pd.DataFrame:
-    """A seeded sample of a group without replacement: a share from all units, then the rest from those that split the
-    judges and, where these are too few, from all again. All units where there are no more than `size`."""
+    """Return a seeded sample of a group without replacement: a share from all units, then the rest from those that
+    split the judges and, where these are too few, from all again. All units where there are no more than `size`."""
     order = [digest([protocol.seed, unit]) for unit in group["unit"]]
     ordered = group.iloc[np.argsort(order)]
     at_random = ordered.head(size - round(size * protocol.split_share))
-    left = ordered.loc[~ordered["unit"].isin(at_random["unit"])]
-    split_first = left.sort_values("split", ascending=False, kind="stable")
+    remaining = ordered.loc[~ordered["unit"].isin(at_random["unit"])]
+    split_first = remaining.sort_values("split", ascending=False, kind="stable")
     return pd.concat([at_random, split_first.head(size - len(at_random))])
 
 
-def strata(whole: pd.DataFrame) -> pd.Series:
-    """The stratum of each unit, on the frame's index."""
-    split = np.where(whole["split"].to_numpy(bool), ", split", "")
-    return pd.Series([f"{group}{part}" for group, part in zip(whole["group"], split, strict=True)], whole.index)
+def strata(population: pd.DataFrame) -> pd.Series:
+    """Return the stratum of each unit, on the frame's index."""
+    split = np.where(population["split"].to_numpy(bool), ", split", "")
+    return pd.Series(
+        [f"{group}{part}" for group, part in zip(population["group"], split, strict=True)], population.index
+    )
 
 
 def queue_of(who: str, sampled: pd.DataFrame) -> list[str]:
-    """The units of a sample in the order of one person, by a seed of their own."""
+    """Return the units of a sample in the order of one person, by a seed of their own."""
     seed = annotation_protocol().seed
     return sorted(map(str, sampled["unit"]), key=lambda unit: digest([seed, who, unit]))
 
 
 def require_task(name: str) -> TaskName:
-    """The task of that name. Raises TrapsError with the known names."""
+    """Return the task of that name. Raises TrapsError with the known names."""
     for task in TASKS:
         if task == name:
             return task

@@ -92,11 +92,11 @@ class Line(BaseModel):
 
 
 def label_lines(folder: Path) -> list[Line]:
-    """The labels in a study's folder of labels, in order; none where nobody has labelled. Raises TrapsError for a line
-    that is not what was written; a last line that a crash cut off was never confirmed and is left out."""
-    path, found = folder / LABELS_FILE, list[Line]()
+    """Return the labels in a study's folder of labels, in order; none where nobody has labelled. Raises TrapsError for
+    a line that is not what was written; a last line that a crash cut off was never confirmed and is left out."""
+    path, lines = folder / LABELS_FILE, list[Line]()
     if not path.is_file():
-        return found
+        return lines
     for line in read_checked(path):
         if line.torn:
             continue
@@ -107,28 +107,28 @@ def label_lines(folder: Path) -> list[Line]:
             LABELS[read.task].model_validate(read.label)
         except ValidationError as error:
             raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
-        found.append(read)
-    return found
+        lines.append(read)
+    return lines
 
 
 # --- labels of what the study has -------------------------------------------------------------------------------------
 
 
 def human_labels(workspace: Workspace) -> pd.DataFrame:
-    """HUMAN_LABELS rows: the last label of each person about each unit that the study still has."""
+    """Return HUMAN_LABELS rows: the last label of each person about each unit that the study still has."""
     last: dict[tuple[TaskName, str, str], dict[str, Any]] = {}
     for line in label_lines(workspace.labels):
         key = line.task, line.unit, line.who
         row = {"task": line.task, "unit": line.unit, "annotator": line.who, "created_at": line.at, **line.label}
         last[key] = row | {"seconds": last[key]["seconds"] if key in last else line.seconds}
-    given, frames = pd.DataFrame(list(last.values())), list[pd.DataFrame]()
-    for task in TASKS if len(given) else ():
-        own = given.loc[given["task"] == task]
+    latest, frames = pd.DataFrame(list(last.values())), list[pd.DataFrame]()
+    for task in TASKS if len(latest) else ():
+        own = latest.loc[latest["task"] == task]
         if len(own):
-            whole = units(workspace, task)
-            whole["stratum"] = strata(whole)
-            whole["stratum_size"] = whole.groupby("stratum")["unit"].transform("size")
-            frames.append(own.merge(whole, on="unit", how="inner", validate="many_to_one"))
+            population = units(workspace, task)
+            population["stratum"] = strata(population)
+            population["stratum_size"] = population.groupby("stratum")["unit"].transform("size")
+            frames.append(own.merge(population, on="unit", how="inner", validate="many_to_one"))
     if not frames:
         return pd.DataFrame(columns=pd.Index(HUMAN_LABELS.names))
     rows = pd.concat(frames, ignore_index=True).reindex(columns=pd.Index(HUMAN_LABELS.names))
@@ -136,7 +136,8 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
 
 
 def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows, in which answers about clips are read as models' answers are: abstained, and correct on a control."""
+    """Return the rows, in which answers about clips are read as models' answers are: abstained, and correct on a
+    control."""
     columns = ["item_id", "ground_truth", "answer_type", "labels", "aliases"]
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS).set_index("item_id").to_dict("index")
 
@@ -158,7 +159,7 @@ def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
-    """HUMAN_AGREEMENT rows from HUMAN_LABELS rows."""
+    """Return HUMAN_AGREEMENT rows from HUMAN_LABELS rows."""
     rows = []
     for task in TASKS:
         own = labels.loc[labels["task"] == task]
@@ -185,8 +186,8 @@ def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str,
 
 
 def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
-    """Of labels as `matrix` gives them: the units that two people or more labelled, the share of pairs of labels of the
-    same unit that are equal, and Krippendorff's alpha; NaN where undefined."""
+    """Return of labels as `matrix` gives them: the units that two people or more labelled, the share of pairs of labels
+    of the same unit that are equal, and Krippendorff's alpha; NaN where undefined."""
     several = int(((values != INVALID).sum(axis=1) > 1).sum())
     pairs = [values[:, [a, b]] for a, b in combinations(range(values.shape[1]), 2)]
     shared = np.concatenate([both[(both != INVALID).all(axis=1)] for both in pairs] or [np.zeros((0, 2), np.int8)])
@@ -195,7 +196,7 @@ def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
 
 
 def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
-    """Labels as YES, NO and INVALID (not labelled): (units, people) int8, both in alphabetical order."""
+    """Return labels as YES, NO and INVALID (not labelled): (units, people) int8, both in alphabetical order."""
     names, people = (sorted(labels[column].unique()) for column in ("unit", "annotator"))
     values = np.full((len(names), len(people)), INVALID, np.int8)
     places = (
@@ -207,8 +208,8 @@ def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
 
 
 def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
-    """What most people say about each unit of ABOUT_ANSWERS: one row a unit, in the columns of HUMAN_LABELS and `truth`
-    (null where as many say yes as no)."""
+    """Return what most people say about each unit of ABOUT_ANSWERS: one row a unit, in the columns of HUMAN_LABELS and
+    `truth` (null where as many say yes as no)."""
     if task not in ABOUT_ANSWERS:
         raise ValueError(f"{task}: the panel decides nothing of the kind")
     own = labels.loc[labels["task"] == task]
@@ -219,7 +220,7 @@ def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
 
 
 def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
-    """The labels of confabulation as `traps people validate` reads them, from HUMAN_LABELS rows: of failures
+    """Return the labels of confabulation as `traps people validate` reads them, from HUMAN_LABELS rows: of failures
     that everybody who labelled any has labelled. Raises TrapsError where there are none."""
     own = labels.loc[labels["task"] == "confabulation"]
     everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()

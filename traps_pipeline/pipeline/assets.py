@@ -39,12 +39,12 @@ class WorkspaceResource(dg.ConfigurableResource):
         self._steps.close()
 
     def open(self) -> Workspace:
-        """The workspace. Raises TrapsError naming the remedy where there is none."""
+        """Return the workspace. Raises TrapsError naming the remedy where there is none."""
         return Workspace.open(place_of(self.root))
 
 
 def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
-    """An asset of each stage, and an observable one of each source."""
+    """Return an asset of each stage, and an observable one of each source."""
     return [_asset(graph, one) if isinstance(one, Stage) else _observable(one) for one in graph.declared.values()]
 
 
@@ -98,7 +98,7 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
 
 
 def _contract(table: Table) -> dict[str, Any]:
-    """A table's columns and the meaning of a row, as Dagster shows them."""
+    """Return a table's columns and the meaning of a row, as Dagster shows them."""
     columns = [
         dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
         for c in table.columns

@@ -102,10 +102,10 @@ def _stages(costs: bool) -> list[Stage]:
 def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
     """Fail the check `current` for what Dagster does not see by itself: files that are altered or gone, and assets
     without partitions that are not current. reported: what this process has reported before."""
-    wanted, history = StudyPartitions(workspace), History(instance, the_graph())
+    partitions, history = StudyPartitions(workspace), History(instance, the_graph())
     for stage in the_graph().stages:
         recorded = history.recorded(stage.name)
-        for key in stage.wanted(wanted):
+        for key in stage.wanted(partitions):
             status = lineage.status(stage.name, key)
             wrong = [*status.outdated] if stage.scheme is None else [*filter(None, [lineage.damage(stage.name, key)])]
             if status.kind == "missing" and key in recorded:
@@ -127,7 +127,7 @@ def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: 
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Runs of what is outdated and can be made anew now. What waits for these is requested at a later look."""
+    """Return runs of what is outdated and can be made anew now. What waits for these is requested at a later look."""
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)

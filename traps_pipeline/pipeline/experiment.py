@@ -117,8 +117,8 @@ class Experiment(BaseModel):
         return Asked(**values, mechanism=self.mechanism is not None)
 
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
-        """The study with the panel that judges this experiment: the one that the command says, else the experiment's,
-        else an existing study's. study: None for a new one.
+        """Return the study with the panel that judges this experiment: the one that the command says, else the
+        experiment's, else an existing study's. study: None for a new one.
 
         Raises TrapsError where none is named, where command and experiment name two, and where rules would judge
         models that they are not made for although nobody said so.
@@ -138,7 +138,7 @@ class Experiment(BaseModel):
         return base.model_copy(update={"panel": named, "judged_by_rules": by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
-        """Raises TrapsError if an existing study has another panel or epoch than this experiment asks for, or another
+        """Raise TrapsError if an existing study has another panel or epoch than this experiment asks for, or another
         `mechanism` section."""
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
@@ -151,7 +151,7 @@ class Experiment(BaseModel):
             )
 
     def cells(self) -> list[Cell]:
-        """All cells of the experiment, ordered first by model; a model with fewer runs has fewer cells. Raises
+        """Return all cells of the experiment, ordered first by model; a model with fewer runs has fewer cells. Raises
         TrapsError for an unknown model."""
         cells = []
         for model in self.models:
@@ -172,7 +172,7 @@ def _known(values: list[str], known: tuple[str, ...]) -> list[str]:
 
 
 def load_experiment(name: str) -> Experiment:
-    """An experiment by name (`demo`) or path (`my.yaml`). Raises TrapsError with the known names."""
+    """Return an experiment by name (`demo`) or path (`my.yaml`). Raises TrapsError with the known names."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
         known = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))

@@ -45,7 +45,7 @@ class RunReport:
     tallies: Mapping[str, Tally] = field(default_factory=dict)
 
     def tally(self, stage: str) -> Tally:
-        """The work of one stage."""
+        """Return the work of one stage."""
         return self.tallies.get(stage, Tally())
 
     @property

@@ -101,13 +101,13 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     if judge is None:
         return Plan(calls, uncertain, forecasts, None, steered, pairs, local)
     labels = _count_labels(workspace, experiment, judge)
-    taken = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
-    forecasts.append(replace(taken, participant="confabulation labels"))
+    cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
+    forecasts.append(replace(cost, participant="confabulation labels"))
     return Plan(calls, uncertain, forecasts, labels, steered, pairs, local)
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
-    """Calls for the answers of steered models, and for the panel's votes on them, by model."""
+    """Return calls for the answers of steered models, and for the panel's votes on them, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
         return counts
@@ -117,11 +117,11 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment, study: S
         answers, votes = counts[model] = (Count(), Count())
         datasets = [name for name in experiment.datasets if name in DATASETS]
         for regime, by_side in count_answers(settings, model, datasets, Counter(taxonomies)).items():
-            wanted, ballots = by_side.total(), seats * sum(len(tasks_for(s)) * n for s, n in by_side.items())
+            n_answers, ballots = by_side.total(), seats * sum(len(tasks_for(s)) * n for s, n in by_side.items())
             folder, known = SteeredEvaluation(model, regime, 1).key, [0, 0]
             if workspace is not None:
                 known = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
-            answers.add(wanted, min(known[0], wanted))
+            answers.add(n_answers, min(known[0], n_answers))
             votes.add(ballots, min(known[1], ballots))
     return counts
 
@@ -134,8 +134,8 @@ def _local_costs(
     calls: Mapping[str, tuple[Count, Count]],
     steered: Mapping[str, tuple[Count, Count]],
 ) -> Iterator[Cost]:
-    """What local models take of a card: their new answers; and, as nothing tells how much of it is known, all passes
-    of states and patches of a study that has no states of the model yet."""
+    """Yield what local models take of a card: their new answers; and, as nothing tells how much of it is known, all
+    passes of states and patches of a study that has no states of the model yet."""
     settings, scenarios = experiment.mechanism, load_scenarios(study).values()
     taxonomies = Counter(datasets_of_category(scenario.category)[0] for scenario in scenarios)
     for model in dict.fromkeys([*calls, *(settings.models if settings else ())]):
@@ -151,19 +151,19 @@ def _local_costs(
             if settings.steering and model in steered:
                 most = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
                 work.append((inside, Work("steered answers", steered[model][0].new, most), params))
-        for shown, one, params in work:
-            assert shown.media is not None, "local entries have media"
+        for media, one, params in work:
+            assert media.media is not None, "local entries have media"
             if one.passes:
-                yield cost_of(shown, shown.media, one, CARDS[card], quantised=params.quantisation == "nf4")
+                yield cost_of(media, media.media, one, CARDS[card], quantised=params.quantisation == "nf4")
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
-    """Calls to the confabulation judge about the experiment's models; a model that is not judged yet counts with a full
-    sample."""
-    protocol, wanted = load_protocol(), {cell.key for cell in experiment.cells()}
+    """Return calls to the confabulation judge about the experiment's models; a model that is not judged yet counts with
+    a full sample."""
+    protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
     labels, lineage = Count(), Lineage(workspace) if workspace else None
     for model in protocol.models:
-        cells = [cell for cell in protocol.cells(model) if cell.key in wanted]
+        cells = [cell for cell in protocol.cells(model) if cell.key in cell_keys]
         if not cells:
             continue
         if workspace is None or lineage is None or not _judged(lineage, cells):
@@ -176,9 +176,9 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
 
 
 def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
-    """Whether the verdicts of all cells whose dataset has items exist and are current."""
-    made = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
-    return bool(made) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in made)
+    """Return whether the verdicts of all cells whose dataset has items exist and are current."""
+    with_items = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
+    return bool(with_items) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in with_items)
 
 
 def _count_calls(
@@ -262,18 +262,18 @@ def _count_cell(
 
 
 def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
-    """The number of rows of a cell's table; None unless it is fresh."""
+    """Return the number of rows of a cell's table; None unless it is fresh."""
     state = workspace.tables.state(table, cell.partition)
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
 
 
 def _items_current(lineage: Lineage, dataset: str) -> bool:
-    """Whether a dataset's items, and everything they are made from, are current."""
+    """Return whether a dataset's items, and everything they are made from, are current."""
     return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
 
 
 def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
-    """The partitions of a dataset's items and of what they are made from, as far as they are there."""
+    """Return the partitions of a dataset's items and of what they are made from, as far as they are there."""
     parents = lineage.graph.parents("items", dataset).items()
     above = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
     return [node for node in above if lineage.state(*node)]

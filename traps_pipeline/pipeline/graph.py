@@ -130,11 +130,11 @@ class Stage:
     shared: ConcurrentBuild | None = None
 
     def columns(self, key: str | None) -> Mapping[str, Any]:
-        """Values of the table's partition columns for a key."""
+        """Return values of the table's partition columns for a key."""
         return {} if self.scheme is None or key is None else self.scheme.columns(key)
 
     def wanted(self, wanted: StudyPartitions) -> list[str | None]:
-        """The keys that a study wants, in key order."""
+        """Return the keys that a study wants, in key order."""
         keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(wanted)
         return [key for key in keys if self.wants(wanted, key)]
 
@@ -161,7 +161,7 @@ class Graph:
         return one
 
     def source(self, name: str) -> Source | None:
-        """The source of that name; None for a stage."""
+        """Return the source of that name; None for a stage."""
         one = self.declared[name]
         return one if isinstance(one, Source) else None
 
@@ -171,26 +171,26 @@ class Graph:
         return [name for name, one in self.declared.items() if isinstance(one, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
-        """Stages (default: all) in order, those together that can be made in one run: they share a scheme, and nothing
-        of another scheme stands between them. Among what is ready, the groups come in the order of `GROUPS`."""
-        left = {
+        """Return stages (default: all) in order, those together that can be made in one run: they share a scheme, and
+        nothing of another scheme stands between them. Among what is ready, the groups come in the order of `GROUPS`."""
+        remaining = {
             name: one
             for name, one in self.declared.items()
             if isinstance(one, Stage) and (names is None or name in names)
         }
-        above = {name: {p for p in self.parents_of[name] if p in left} for name in left}
-        found: list[list[Stage]] = []
-        while left:
-            ready = [name for name in left if not above[name] & left.keys()]
+        above = {name: {p for p in self.parents_of[name] if p in remaining} for name in remaining}
+        result: list[list[Stage]] = []
+        while remaining:
+            ready = [name for name in remaining if not above[name] & remaining.keys()]
             if not ready:
-                raise TrapsError(f"the graph has a circle among {', '.join(left)}")
-            first = min(ready, key=lambda name: GROUPS.index(left[name].group))
-            scheme, block = left[first].scheme, list[Stage]()
+                raise TrapsError(f"the graph has a circle among {', '.join(remaining)}")
+            first = min(ready, key=lambda name: GROUPS.index(remaining[name].group))
+            scheme, block = remaining[first].scheme, list[Stage]()
             while ready:
-                block += [left.pop(name) for name in ready if left[name].scheme is scheme]
-                ready = [n for n in left if left[n].scheme is scheme and not above[n] & left.keys()]
-            found.append(block)
-        return found
+                block += [remaining.pop(name) for name in ready if remaining[name].scheme is scheme]
+                ready = [n for n in remaining if remaining[n].scheme is scheme and not above[n] & remaining.keys()]
+            result.append(block)
+        return result
 
     @cached_property
     def stages(self) -> list[Stage]:
@@ -198,28 +198,29 @@ class Graph:
         return [stage for block in self.blocks() for stage in block]
 
     def above(self, names: Iterable[str]) -> set[str]:
-        """The stages of these names, and all that they are made from."""
-        found, left = set[str](), [*names]
-        while left:
-            name = left.pop()
-            if name not in found and isinstance(self.declared[name], Stage):
-                found.add(name)
-                left += self.parents_of[name]
-        return found
+        """Return the stages of these names, and all that they are made from."""
+        ancestors, remaining = set[str](), [*names]
+        while remaining:
+            name = remaining.pop()
+            if name not in ancestors and isinstance(self.declared[name], Stage):
+                ancestors.add(name)
+                remaining += self.parents_of[name]
+        return ancestors
 
     def below(self, name: str) -> set[str]:
-        """The stages that are made directly from one."""
+        """Return the stages that are made directly from one."""
         return {child for child, parents in self.parents_of.items() if name in parents}
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def keys(self, name: str) -> list[str | None]:
-        """All partition keys of a stage or source."""
+        """Return all partition keys of a stage or source."""
         scheme = self.declared[name].scheme
         return [None] if scheme is None else [*scheme.keys]
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
-        """Every partition that a partition may be made from, whether it is there or not: keys by stage or source."""
+        """Return every partition that a partition may be made from, whether it is there or not: keys by stage or
+        source."""
         scheme = self.declared[name].scheme
         if key is not None and (scheme is None or key not in scheme.known):
             return {}  # of an experiment that the study has no more
@@ -230,19 +231,19 @@ class Graph:
         }  # fmt: skip
 
     def mapping(self, name: str, parent: str) -> KeyMapping:
-        """Which partitions of a partitioned parent a stage is made from."""
+        """Return which partitions of a partitioned parent a stage is made from."""
         scheme, stated = self.declared[name].scheme, self.parents_of[name][parent].mapping
         return stated or (SAME if scheme is self.declared[parent].scheme else EVERY)
 
 
 def name_of(node: Node) -> str:
-    """`stage` or `stage/key`, as footers store it."""
+    """Return `stage` or `stage/key`, as footers store it."""
     return node[0] if node[1] is None else f"{node[0]}/{node[1]}"
 
 
 @cache
 def the_graph() -> Graph:
-    """The graph of everything that is declared, once `traps_pipeline.pipeline.stages` is imported."""
+    """Return the graph of everything that is declared, once `traps_pipeline.pipeline.stages` is imported."""
     if not DECLARED:
         raise RuntimeError("no stage is declared yet: import traps_pipeline.pipeline.stages first")
     return Graph()

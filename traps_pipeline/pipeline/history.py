@@ -28,30 +28,30 @@ class History:
     def event(
         self, stage: Stage, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
     ) -> dg.AssetMaterialization:
-        """The event that makes a partition count as made, with its data version and what it was made from."""
+        """Return the event that makes a partition count as made, with its data version and what it was made from."""
         tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
         return dg.AssetMaterialization(
             asset_key(stage.name), partition=key, metadata=visible_metadata(metadata), tags=tags
         )
 
     def provenance(self, stage: Stage) -> dict[str, str]:
-        """Tags that say which events of the parents are current. Taken before anything is read."""
+        """Return tags that say which events of the parents are current. Taken before anything is read."""
         tags: dict[str, str] = {}
         for parent in stage.parents:
             key = asset_key(parent)
             name = key.to_user_string()
-            found = self._fetch(parent)(dg.AssetRecordsFilter(asset_key=key), limit=1).records
-            version = _version_of(found[0]) if found else None
+            records = self._fetch(parent)(dg.AssetRecordsFilter(asset_key=key), limit=1).records
+            version = _version_of(records[0]) if records else None
             tags[f"{_INPUT_VERSION}/{name}"] = version or NEVER
-            tags[f"{_INPUT_POINTER}/{name}"] = str(found[0].storage_id) if found else "NULL"
+            tags[f"{_INPUT_POINTER}/{name}"] = str(records[0].storage_id) if records else "NULL"
         return tags
 
     def recorded(self, name: str) -> dict[str | None, str | None]:
-        """The data version that Dagster knows of each partition of a stage or source."""
+        """Return the data version that Dagster knows of each partition of a stage or source."""
         node = self._graph.declared[name]
         if node.scheme is None:
-            found = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
-            return {None: _version_of(found[0])} if found else {}
+            records = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
+            return {None: _version_of(records[0])} if records else {}
         # One query over the index of tags: ten thousand events take seconds to deserialize.
         kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MADE
         tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])

@@ -48,13 +48,13 @@ class Lineage:
         self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
-        """Versions of everything that is there to make a partition from, by name."""
+        """Return versions of everything that is there to make a partition from, by name."""
         nodes = [(parent, k) for parent, keys in self.graph.parents(stage, key).items() for k in keys]
         versions = {name_of(node): self.version(*node) for node in nodes}
         return {name: version for name, version in versions.items() if version is not None}
 
     def status(self, name: str, key: str | None) -> Status:
-        """Whether a partition is there, whole, and made from what is there now by the code that is there now."""
+        """Return whether a partition is there, whole, and made from what is there now by the code that is there now."""
         stage = self.graph[name]
         if damage := self.damage(name, key):
             return Status("stale", (damage,))
@@ -75,7 +75,7 @@ class Lineage:
         return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
-        """Why a partition cannot be made, in words; empty where it can.
+        """Return why a partition cannot be made, in words; empty where it can.
 
         current: parents must also be made from what is there now, as they are where a run has just seen to them.
         """
@@ -95,8 +95,8 @@ class Lineage:
         return ""
 
     def waits(self, name: str, key: str | None) -> bool:
-        """Whether something above a partition is outdated itself or must be made first: it would be made twice. What
-        costs money, and can be done without, may never come and is not waited for."""
+        """Return whether something above a partition is outdated itself or must be made first: it would be made twice.
+        What costs money, and can be done without, may never come and is not waited for."""
         of_stage = self.graph[name].parents
         parents = {
             parent: keys
@@ -157,7 +157,7 @@ def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None
 
 
 def read_report_state(workspace: Workspace, stage: Stage) -> State | None:
-    """The state that `write_report_state` wrote; None if the files were never made."""
+    """Return the state that `write_report_state` wrote; None if the files were never made."""
     path = _report_state(workspace, stage)
     if not workspace.store.has(path):
         return None

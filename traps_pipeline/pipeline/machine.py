@@ -31,17 +31,17 @@ Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a ru
 
 def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
     """Return what a study wants of these stages, or one experiment of it."""
-    wanted = StudyPartitions(workspace, experiment)
-    return {stage.name: stage.wanted(wanted) for stage in the_graph().stages if stage.name in stages}
+    partitions = StudyPartitions(workspace, experiment)
+    return {stage.name: stage.wanted(partitions) for stage in the_graph().stages if stage.name in stages}
 
 
-def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, wanted: StudyPartitions) -> Parts:
+def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
     """Return the stages of a Dagster run that share a step's partitions, each with those that the study wants."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in selected}
     alike = [other for other in the_graph().stages if other.name in names and other.scheme is stage.scheme]
-    return {other.name: [key for key in other.wanted(wanted) if key in keys] for other in alike}
+    return {other.name: [key for key in other.wanted(partitions) if key in keys] for other in alike}
 
 
 def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:

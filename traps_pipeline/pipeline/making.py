@@ -45,21 +45,21 @@ class PartitionMaker:
     def _side_by_side(self, make: Collect, keys: Sequence[str | None]) -> Iterator[tuple[str | None, StageOutput]]:
         pending = [*keys]
         try:
-            for key, made in make.partitions(self._workspace, [str(key) for key in keys]) if keys else ():
+            for key, output in make.partitions(self._workspace, [str(key) for key in keys]) if keys else ():
                 pending.remove(key)
-                yield key, made
+                yield key, output
         except TrapsError as error:
             self.unmade |= dict.fromkeys(pending, error)
 
     def _one(self, make: Make, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
         """Make one. tally: the work that was done for it before."""
         try:
-            made = make(self._workspace, key)
+            output = make(self._workspace, key)
         except TrapsError as error:
             self.unmade[key] = error
             return
-        made.tally.add(tally)
-        yield key, made
+        output.tally.add(tally)
+        yield key, output
 
     # --- beside other runs --------------------------------------------------------------------------------------------
 

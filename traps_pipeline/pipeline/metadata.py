@@ -41,35 +41,37 @@ def visible_metadata(value: Any) -> Any:
     return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
 
 
-def partition_metadata(workspace: Workspace, stage: Stage, made: StageOutput) -> dict[str, Any]:
+def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) -> dict[str, Any]:
     """Return what Dagster shows of a partition or of files for people."""
-    counts: dict[str, Any] = {name: count for name, count in vars(made.tally).items() if count}
+    counts: dict[str, Any] = {name: count for name, count in vars(output.tally).items() if count}
     if stage.table is None:
-        files = cast(Mapping[str, bytes], made.content)
+        files = cast(Mapping[str, bytes], output.content)
         pages = {path: StudyFile(workspace.relative(workspace.reports / path)) for path in files if "/" not in path}
-        return {"files": len(files), **counts, **pages, **made.shown}
+        return {"files": len(files), **counts, **pages, **output.shown}
     count = "dagster/row_count" if stage.scheme is None else "dagster/partition_row_count"
-    return {count: len(made.content), **counts, **preview(stage.table, made), **made.shown}
+    return {count: len(output.content), **counts, **preview(stage.table, output), **output.shown}
 
 
-def preview(table: Table, made: StageOutput) -> dict[str, dg.TableMetadataValue]:
+def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
     """Return rows without long texts by what they are: the best and worst where a table ranks, else the first.
 
     What a model wrote is shown on the report's pages, where it is escaped.
     """
     import pandas as pd
 
-    content = cast(Any, made.content)
+    content = cast(Any, output.content)
     if ranked := next((name for name in RANKED if name in table.names), None):
         frame = content if hasattr(content, "head") else pd.DataFrame(content, columns=pd.Index(table.names))
         ordered = frame.dropna(subset=[ranked]).sort_values(ranked, ascending=False, kind="stable")
         best, worst = ordered.head(PREVIEWED), ordered.iloc[PREVIEWED:].tail(PREVIEWED)
-        shown = {f"best by {ranked}": best.to_dict("records"), f"worst by {ranked}": worst.to_dict("records")}
+        samples = {f"best by {ranked}": best.to_dict("records"), f"worst by {ranked}": worst.to_dict("records")}
     else:
         first = content[:PREVIEWED]
-        shown = {"first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]}
+        samples = {
+            "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
+        }
     names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
     tables = {
-        title: [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows] for title, rows in shown.items()
+        title: [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows] for title, rows in samples.items()
     }
     return {title: dg.MetadataValue.table(records) for title, records in tables.items() if records}

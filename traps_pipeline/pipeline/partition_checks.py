@@ -126,7 +126,7 @@ def _failed_calls(count: int) -> str:
 
 
 def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterator[str]:
-    """What a failed check says, a line each."""
+    """Yield what a failed check says, a line each."""
     if event.passed:
         return
     for name, value in ((name, value.value) for name, value in event.metadata.items() if name != REACHED):

@@ -31,7 +31,7 @@ class _Grid:
         return _Grid(rows[0] if rows else [""], columns)
 
     def cells(self, keys: Iterable[str | None]) -> Iterator[tuple[int, int]]:
-        """Row and column of each key."""
+        """Yield row and column of each key."""
         row_of, column_of = ({name: n for n, name in enumerate(names)} for names in (self.rows, self.columns))
         for key in keys:
             row, _, column = str(key).rpartition("|")
@@ -58,7 +58,7 @@ def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator
 
 
 def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Maximal runs of neighbouring numbers, as (first, last)."""
+    """Return maximal runs of neighbouring numbers, as (first, last)."""
     spans: list[tuple[int, int]] = []
     for number in sorted(numbers):
         if spans and spans[-1][1] == number - 1:
@@ -88,8 +88,8 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
 def _parts(
     wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Rectangles (first and last row, first and last column) around the wanted cells of one whose first cell has these
-    numbers. heads: the model of each column of it."""
+    """Yield rectangles (first and last row, first and last column) around the wanted cells of one whose first cell has
+    these numbers. heads: the model of each column of it."""
     rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
     down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     wanted, heads, top, left = wanted[down, across], heads[across], top + int(rows[0]), left + int(columns[0])
@@ -113,22 +113,22 @@ def _parts(
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
-    """Where lines of these sizes are cut in two, of some places, and how many of the parts go to the first half: such
-    that the parts are of one size, else at a place that is better, else in the middle."""
+    """Return where lines of these sizes are cut in two, of some places, and how many of the parts go to the first half:
+    such that the parts are of one size, else at a place that is better, else in the middle."""
     total = int(sizes.sum())
     first = np.cumsum(sizes)[cuts - 1]
     shares = np.clip(np.rint(count * first / total), 1, count - 1).astype(int)
     largest = np.maximum(first / shares, (total - first) / (count - shares))
-    found = min(range(len(cuts)), key=lambda n: (largest[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
-    return int(cuts[found]), int(shares[found])
+    best = min(range(len(cuts)), key=lambda n: (largest[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
+    return int(cuts[best]), int(shares[best])
 
 
 def shared_out(
     scheme: Partitioning | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
 ) -> list[Range]:
-    """Ranges of runs that share what is to be made of each key. seconds: of work of such a run. There are so many runs,
-    of `most`, that each finds enough to do. As long as they are no more than the keys, each goes through all of them;
-    else the runs of a range go through one key, as many as its work is worth."""
+    """Return ranges of runs that share what is to be made of each key. seconds: of work of such a run. There are so
+    many runs, of `most`, that each finds enough to do. As long as they are no more than the keys, each goes through all
+    of them; else the runs of a range go through one key, as many as its work is worth."""
     count = max(1, min(most, int(sum(seconds.values()) / WORTH_S)))
     if scheme is None or count <= len(keys):
         return cut(scheme, keys, 1) * count

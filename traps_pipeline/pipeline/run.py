@@ -31,7 +31,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class WalkResult:
-    """What a pass over the stages did: problems in sentences, among them checks that do not pass; whether a budget ended it."""
+    """Outcome of a pass: problems in sentences, failed checks among them; whether a budget ended it."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -123,7 +123,7 @@ def _alive(pid: int) -> bool:
 
 
 def pending_in(
-    block: Sequence[Stage], lineage: Lineage, history: History, wanted: StudyPartitions, *, existing: bool = False
+    block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
     """Return the stages of a block that have something to make, or stand below one that has, and the keys of these.
 
@@ -132,7 +132,7 @@ def pending_in(
     pending: dict[str, list[str | None]] = {}
     for stage in block:
         recorded = history.recorded(stage.name)
-        every = stage.wanted(wanted)
+        every = stage.wanted(partitions)
         keys = [k for k in every if to_make(lineage, recorded, stage.name, k, existing=existing)]
         keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
         if keys or lineage.graph.parents_of[stage.name].keys() & pending.keys():

@@ -42,8 +42,8 @@ class Runs(ABC):
 
     @abstractmethod
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """The keys, cut into ranges that are made in one run each. A range may hold other keys too, which a run leaves
-        alone, and runs may have the same one, where they share what is to be made."""
+        """Return the keys, cut into ranges that are made in one run each. A range may hold other keys too, which a run
+        leaves alone, and runs may have the same one, where they share what is to be made."""
 
     @abstractmethod
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
@@ -108,7 +108,8 @@ class RunsHere(Runs):
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
-    """The tags of a run of a range. A single key needs none, unless Dagster is told of it in no other way (always)."""
+    """Return the tags of a run of a range. A single key needs none, unless Dagster is told of it in no other way
+    (always)."""
     first, last = one
     if first is None or (first == last and not always):
         return {}
@@ -116,26 +117,26 @@ def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
 
 
 def range_of(tags: Mapping[str, str]) -> Range:
-    """The partitions of a run, by its tags: those of `range_tags`, or Dagster's own of a single key."""
+    """Return the partitions of a run, by its tags: those of `range_tags`, or Dagster's own of a single key."""
     single = tags.get("dagster/partition")
     return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
 
 
 def this_host() -> str:
-    """Where process numbers mean what they mean here: the machine and its namespace of processes."""
+    """Return where process numbers mean what they mean here: the machine and its namespace of processes."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 
 
 def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
-    """What failed steps say."""
+    """Return what failed steps say."""
     problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
     over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
     return Ran(problems, over)
 
 
 def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
-    """Whether a run, or a step of it that others wait for, ended for no reason that it could tell: its host, the
+    """Return whether a run, or a step of it that others wait for, ended for no reason that it could tell: its host, the
     network or the database failed."""
     named = [{error.cls_name for error in _causes(event)} for event in failures]
     is_interrupted = any(names & {*_INTERRUPTS} for names in named)
@@ -144,7 +145,7 @@ def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
 
 
 def _causes(event: dg.DagsterEvent) -> list[Any]:
-    """The error of a failed step and its causes, outermost first."""
+    """Return the error of a failed step and its causes, outermost first."""
     return _chain(event.step_failure_data.error)
 
 
@@ -157,7 +158,8 @@ def _chain(error: Any) -> list[Any]:
 
 
 def reason(error: Any) -> str:
-    """What an error that Dagster wrote down says: our own sentences where there are some, else its innermost cause."""
+    """Return what an error that Dagster wrote down says: our own sentences where there are some, else its innermost
+    cause."""
     chain = _chain(error)
     readable = [one for one in chain if one.cls_name in _SENTENCES]
     if not readable:

@@ -11,7 +11,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def study_here() -> Workspace | None:
-    """The workspace that the environment names; None where there is none yet."""
+    """Return the workspace that the environment names; None where there is none yet."""
     place = Workspace.default_place()
     return Workspace.open(place) if Workspace.is_there(place) else None
 
@@ -62,11 +62,11 @@ by_steering = ByDimension("steering")
 
 
 def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], Iterable[str]]) -> Pairs:
-    """What partitions below are made from each above, of the keys that the study has."""
+    """Return what partitions below are made from each above, of the keys that the study has."""
     pairs = {key: sorted(below.known & {*mapping(key)}) for key in sorted(above.known)}
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 
 
 def these_keys(above: Partitioning, keys: Iterable[str]) -> These:
-    """Of all partitions above these, as far as the study has them."""
+    """Return of all partitions above these, as far as the study has them."""
     return These([key for key in keys if key in above.known])

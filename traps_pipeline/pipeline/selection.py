@@ -23,7 +23,8 @@ _HISTORY = Path("history", "runs", "index.db")  # of Dagster's SQLite storage, b
 
 
 def stages_until(until: str | None) -> set[str]:
-    """All stages; with `until` (names with commas between), these and what they are made from. Raises TrapsError."""
+    """Return all stages; with `until` (names with commas between), these and what they are made from. Raises
+    TrapsError."""
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
@@ -36,21 +37,21 @@ def stages_until(until: str | None) -> set[str]:
 
 def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
     """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
-    wanted, graph = StudyPartitions(workspace, experiment), the_graph()
-    if not wanted.cells and not wanted.states:
+    partitions, graph = StudyPartitions(workspace, experiment), the_graph()
+    if not partitions.cells and not partitions.states:
         raise TrapsError(
             f"experiment {experiment} asks nothing: none of its scenarios belongs to its datasets, or no model has its "
             "runs; change `scenarios`, `datasets` or `runs`"
         )
-    if empty := [name for name in until.split(",") if not graph[name].wanted(wanted)] if until else []:
+    if empty := [name for name in until.split(",") if not graph[name].wanted(partitions)] if until else []:
         raise TrapsError(f"--until {', '.join(empty)}: experiment {experiment} wants nothing of it; name another stage")
 
 
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
-    """Checks of what is wanted that do not pass, whichever run made it."""
-    wanted, problems = StudyPartitions(workspace, experiment), []
+    """Return checks of what is wanted that do not pass, whichever run made it."""
+    partitions, problems = StudyPartitions(workspace, experiment), []
     for stage in the_graph().stages:
-        for key in stage.wanted(wanted):
+        for key in stage.wanted(partitions):
             for check in workspace.failed_checks(stage.name, key):
                 details = workspace.failure(stage.name, check, key)
                 problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
@@ -68,12 +69,12 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
     """Write down, after a run without problems, which versions Dagster's history holds, and what state it is in."""
     if (history := _history_state(workspace)) is None:
         return
-    lineage, wanted = Lineage(workspace), StudyPartitions(workspace, experiment)
+    lineage, partitions = Lineage(workspace), StudyPartitions(workspace, experiment)
     graph = lineage.graph
     versions = {
         name_of((name, key)): lineage.version(name, key)
         for name in sorted(stages)
-        for key in graph[name].wanted(wanted)
+        for key in graph[name].wanted(partitions)
     }
     former = _read_note(workspace)
     if former.get("history") == history:  # of other stages or another experiment: Dagster holds these too
@@ -83,16 +84,16 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
 
 
 def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: str | None) -> bool:
-    """Whether every wanted partition is fresh and known to Dagster, whose history is as the last run left it."""
+    """Return whether every wanted partition is fresh and known to Dagster, whose history is as the last run left it."""
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
-    lineage, wanted, known = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
+    lineage, partitions, known = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
     return all(
         known.get(name_of((name, key))) == lineage.version(name, key) is not None
         and lineage.status(name, key).kind == "fresh"
         for name in stages
-        for key in lineage.graph[name].wanted(wanted)
+        for key in lineage.graph[name].wanted(partitions)
     )
 
 
@@ -106,7 +107,8 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
-    """Where Dagster's history lies, and the size and time of its files; None where it is no file of this machine."""
+    """Return where Dagster's history lies, and the size and time of its files; None where it is no file of this
+    machine."""
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     index = home / _HISTORY
     if workspace.is_shared or not index.is_file():

@@ -46,7 +46,7 @@ def code_of(group: str) -> str:
 
 
 def is_declared(name: str) -> bool:
-    """Whether a stage or source, declared before, is part of the study's graph."""
+    """Return whether a stage or source, declared before, is part of the study's graph."""
     return name in DECLARED
 
 

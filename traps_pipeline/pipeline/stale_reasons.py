@@ -41,12 +41,12 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
                 rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
                 if not rows:
                     continue
-                wanted = answer_request(workspace, entry, current, evaluation) if current else None
+                request = answer_request(workspace, entry, current, evaluation) if current else None
                 cell = Cell(dataset, evaluation)
                 explanation["evaluations"].append(
                     {
                         "evaluation": evaluation.key,
-                        "state": _state(rows, wanted.components if wanted else None),
+                        "state": _state(rows, request.components if request else None),
                         "answers": _rows_of(workspace, RESPONSES, _OF_ANSWER, cell, item_id),
                         "votes": _rows_of(workspace, VOTES, _OF_VOTE, cell, item_id),
                     }

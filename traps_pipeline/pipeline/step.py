@@ -52,11 +52,11 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
         yield from step.checks.of_parents(step.lineage, key)
         step.admit(key)
     made_result: dg.MaterializeResult | None = None
-    for key, made in step.make():
-        version = step.write(key, made)
-        yield from step.checks.of_made(key, made)
-        progress.current().partition(stage.name, key or "", made.tally, is_empty=not len(made.content))
-        metadata = partition_metadata(workspace, stage, made) | {TALLY: json.dumps(vars(made.tally))}
+    for key, output in step.make():
+        version = step.write(key, output)
+        yield from step.checks.of_made(key, output)
+        progress.current().partition(stage.name, key or "", output.tally, is_empty=not len(output.content))
+        metadata = partition_metadata(workspace, stage, output) | {TALLY: json.dumps(vars(output.tally))}
         if stage.scheme is None:
             metadata = visible_metadata(metadata)
             made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
@@ -77,8 +77,8 @@ class _Step:
         self.tags = context.run.tags
         if context.run.run_id not in _ATTEMPTS:
             _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
-        wanted = StudyPartitions(workspace, self.tags.get(EXPERIMENT_TAG))
-        require_machine(workspace, parts_of_run(context, stage, wanted))
+        partitions = StudyPartitions(workspace, self.tags.get(EXPERIMENT_TAG))
+        require_machine(workspace, parts_of_run(context, stage, partitions))
         self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
         self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
         self.provenance = self.history.provenance(stage) if stage.scheme else {}
@@ -86,7 +86,7 @@ class _Step:
         self._maker = PartitionMaker(workspace, stage, self.history)
         self._inputs: dict[str | None, Mapping[str, str]] = {}  # of what is made, noted before anything is read
         keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
-        asked = {*stage.wanted(wanted)}
+        asked = {*stage.wanted(partitions)}
         self._wanted, self._unwanted = [k for k in keys if k in asked], [k for k in keys if k not in asked]
 
     def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
@@ -123,11 +123,11 @@ class _Step:
             progress.current().stage(self.stage.name, len(self._inputs))
         return self._maker.make(self._inputs)
 
-    def write(self, key: str | None, made: StageOutput) -> str:
+    def write(self, key: str | None, output: StageOutput) -> str:
         """Write what was made; return its data version."""
-        stage, inputs, content = self.stage, self._inputs[key], made.content
+        stage, inputs, content = self.stage, self._inputs[key], output.content
         if stage.table is not None:
-            rows, failed = cast(Any, content), made.tally.errors
+            rows, failed = cast(Any, content), output.tally.errors
             return self.workspace.tables.write(
                 stage.table, stage.columns(key), rows, inputs, failed=failed, code=stage.code
             )
@@ -153,7 +153,7 @@ class _Step:
             yield self.checks.of_unmade(key, error)
         yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
 
-    def hand_on(self, made: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
+    def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
         """Hand on what an asset without partitions has made, or outputs for which Dagster writes no event of its own.
 
         It skips what is below a step without outputs, and would write one event, with one version, for all partitions.
@@ -162,10 +162,10 @@ class _Step:
         for name in self.context.op_def.output_dict:
             if name != "result":
                 yield dg.Output(None, output_name=name)  # of a check
-        yield made or dg.MaterializeResult(metadata={SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION: True})
+        yield result or dg.MaterializeResult(metadata={SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION: True})
 
     def stages_below(self) -> set[str]:
-        """The stages of this run that are made directly from this one."""
+        """Return the stages of this run that are made directly from this one."""
         selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
         return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
 
@@ -201,8 +201,8 @@ def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> 
 def to_make(
     lineage: Lineage, recorded: Mapping[str | None, str | None], name: str, key: str | None, *, existing: bool = False
 ) -> bool:
-    """Whether a partition is missing, stale, or unknown to Dagster: a crash between a table and its event leaves such a
-    table, which is made once more. existing: only what is there and made from what has changed since."""
+    """Return whether a partition is missing, stale, or unknown to Dagster: a crash between a table and its event leaves
+    such a table, which is made once more. existing: only what is there and made from what has changed since."""
     status = lineage.status(name, key)
     if existing or status.kind == "missing":
         return bool(status.outdated) if existing else True

@@ -30,9 +30,9 @@ class StageStatus:
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
     """Yield the status of every stage, over the partitions that the study wants, or one of its experiments."""
-    wanted = StudyPartitions(workspace, experiment)
+    partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
-        statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(wanted)}
+        statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}
         stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
         missing = [key for key, status in statuses.items() if status.kind == "missing"]
         yield StageStatus(stage.name, len(statuses) - len(stale) - len(missing), stale, missing)

@@ -20,7 +20,9 @@ for _category in (dg.BetaWarning, dg.PreviewWarning):
 
 
 def asset_key(name: str) -> dg.AssetKey:
-    """The asset key of a stage or source: its name, behind the study's where several studies share one history."""
+    """Return the asset key of a stage or source: its name, behind the study's where several studies share one
+    history.
+    """
     return dg.AssetKey([*_prefix(), name])
 
 
@@ -36,13 +38,13 @@ def _prefix() -> tuple[str, ...]:
 
 @cache
 def partitions_of(scheme: Partitioning) -> dg.PartitionsDefinition:
-    """The partitions of a scheme, the same object for the same one."""
+    """Return the partitions of a scheme, the same object for the same one."""
     parts = {name: dg.StaticPartitionsDefinition([*keys]) for name, keys in scheme.dimensions.items()}
     return next(iter(parts.values())) if len(parts) == 1 else dg.MultiPartitionsDefinition(parts)
 
 
 def asset_deps(graph: Graph, name: str) -> list[dg.AssetDep]:
-    """What a stage is made from."""
+    """Return what a stage is made from."""
     deps = []
     for parent in graph.parents_of[name].values():
         is_partitioned = graph.declared[parent.name].scheme is not None

@@ -176,10 +176,10 @@ class StudyPartitions:
 
 
 def _evaluations(asked: Asked) -> list[Evaluation]:
-    """Those that a model has enough runs for; of no runs named, all that it has."""
-    found = []
+    """Return those that a model has enough runs for; of no runs named, all that it has."""
+    evaluations = []
     for model in asked.models:
         available = range(1, get_model(model).runs + 1)
         runs = [run for run in available if not asked.runs or run in asked.runs]
-        found += [Evaluation(model, regime, run) for regime in asked.regimes for run in runs]
-    return found
+        evaluations += [Evaluation(model, regime, run) for regime in asked.regimes for run in runs]
+    return evaluations

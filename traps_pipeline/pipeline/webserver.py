@@ -59,7 +59,7 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
 
 
 def _start(module: str, *arguments: str, token: str | None = None) -> int:
-    """The process id of a module that is run as a program. token: for its environment."""
+    """Return the process id of a module that is run as a program. token: for its environment."""
     environment = _PATIENCE | os.environ | {"DAGSTER_IS_DEV_CLI": "1"} | ({TOKEN_VARIABLE: token} if token else {})
     return subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment).pid
 
@@ -74,7 +74,7 @@ def _wait_for_socket(address: str, started: dict[int, str]) -> None:
 
 
 def study_route(workspace: Workspace) -> Route:
-    """A route to the study's report, site and clips, for the links that assets show."""
+    """Return a route to the study's report, site and clips, for the links that assets show."""
     from starlette.responses import FileResponse, PlainTextResponse, Response
     from starlette.routing import Route
 
@@ -105,8 +105,8 @@ def main() -> None:
     ):
         app = create_app_from_workspace_process_context(context)
         app.routes.insert(0, study_route(Workspace.open()))  # Dagster's own last route takes every path
-        shown = f"[{host}]" if ":" in host else host
-        print(f"\n  open http://{shown}:{port}/?token={token}\n", file=sys.stderr, flush=True)
+        address = f"[{host}]" if ":" in host else host
+        print(f"\n  open http://{address}:{port}/?token={token}\n", file=sys.stderr, flush=True)
         uvicorn.run(
             Guard(app, token, host, port),
             host=host,

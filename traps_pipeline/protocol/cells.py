@@ -31,11 +31,11 @@ class Evaluation:
 
     @staticmethod
     def parse(key: str) -> Evaluation:
-        """Inverse of `key`. Raises ValueError naming what is wrong."""
-        found = _EVALUATION.fullmatch(key)
-        if found is None or found["regime"] not in REGIMES:
+        """Return inverse of `key`. Raises ValueError naming what is wrong."""
+        match = _EVALUATION.fullmatch(key)
+        if match is None or match["regime"] not in REGIMES:
             raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
-        return Evaluation(check_name(found["model"]), found["regime"], int(found["run"]))
+        return Evaluation(check_name(match["model"]), match["regime"], int(match["run"]))
 
 
 @dataclass(frozen=True, order=True)
@@ -58,7 +58,7 @@ class Cell:
 
     @staticmethod
     def parse(key: str) -> Cell:
-        """Inverse of `key`. Raises ValueError."""
+        """Return inverse of `key`. Raises ValueError."""
         dataset, _, evaluation = key.partition("|")
         if dataset not in (*DATASETS, *BESIDE):
             raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *BESIDE)}")
@@ -87,7 +87,7 @@ class Extraction:
 
     @staticmethod
     def parse(key: str) -> Extraction:
-        """Inverse of `key`. Raises ValueError naming what is wrong."""
+        """Return inverse of `key`. Raises ValueError naming what is wrong."""
         model, _, prompt = key.partition("__")
         if prompt not in VQA_PROMPTS:
             raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
@@ -113,7 +113,7 @@ class StatesCell:
 
     @staticmethod
     def parse(key: str) -> StatesCell:
-        """Inverse of `key`. Raises ValueError."""
+        """Return inverse of `key`. Raises ValueError."""
         dataset, _, extraction = key.partition("|")
         if dataset not in PROBED_DATASETS:
             raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {PROBED_DATASETS}")
@@ -154,12 +154,12 @@ class SteeringCell(Cell):
 
     @staticmethod
     def make(dataset: str, model: str, directions: str, regime: str) -> SteeringCell:
-        """The cell of these."""
+        """Return the cell of these."""
         return SteeringCell(dataset, SteeredEvaluation(model, regime, 1), directions)
 
     @staticmethod
     def parse(key: str) -> SteeringCell:
-        """Inverse of `key`. Raises ValueError."""
+        """Return inverse of `key`. Raises ValueError."""
         dataset, _, run = key.partition("|")
         parts = run.split("__")
         # A graph has a key of each dataset of its study, arms too; only those of the pairs are ever wanted.

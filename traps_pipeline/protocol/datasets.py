@@ -49,17 +49,17 @@ SIDES = ("control", "void")
 
 
 def taxonomy_of(dataset: str) -> str:
-    """`occlusion` or `chaotic`."""
+    """Return `occlusion` or `chaotic`."""
     return dataset.removesuffix("_ill_posed")
 
 
 def is_ill_posed(dataset: str) -> bool:
-    """Whether the void of a pair is the control's clip with an unanswerable question."""
+    """Return whether the void of a pair is the control's clip with an unanswerable question."""
     return dataset.endswith("_ill_posed")
 
 
 def transfer_type(source: str, target: str) -> str:
-    """What a path between datasets crosses (docs/spec.md 7.2): modality of the void, domain, both or neither."""
+    """Return what a path between datasets crosses (docs/spec.md 7.2): modality of the void, domain, both or neither."""
     domain = taxonomy_of(source) != taxonomy_of(target)
     modality = is_ill_posed(source) != is_ill_posed(target)
     return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
@@ -68,37 +68,37 @@ def transfer_type(source: str, target: str) -> str:
 
 
 def taxonomy_of_category(category: str) -> str:
-    """`occlusion` or `chaotic`."""
+    """Return `occlusion` or `chaotic`."""
     return "chaotic" if category in CHAOTIC_CATEGORIES else "occlusion"
 
 
 def datasets_of_category(category: str) -> tuple[str, str]:
-    """The two datasets (visual, ill-posed) that a category's scenarios belong to."""
+    """Return the two datasets (visual, ill-posed) that a category's scenarios belong to."""
     taxonomy = taxonomy_of_category(category)
     return taxonomy, f"{taxonomy}_ill_posed"
 
 
 def arms_of(taxonomy: str) -> tuple[str, ...]:
-    """The arms that scenarios of a taxonomy may have."""
+    """Return the arms that scenarios of a taxonomy may have."""
     return tuple(arm for arm in beside_of(taxonomy) if arm in ARMS)
 
 
 def beside_of(taxonomy: str) -> tuple[str, ...]:
-    """The arms and variations that scenarios of a taxonomy may have."""
+    """Return the arms and variations that scenarios of a taxonomy may have."""
     return tuple(name for name in BESIDE if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:
-    """Everything that a category's scenarios are asked in."""
+    """Return everything that a category's scenarios are asked in."""
     return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
 
 
 def dataset_of(item_id: str) -> str:
-    """The dataset of an item, by its id `dataset:scenario:side`."""
+    """Return the dataset of an item, by its id `dataset:scenario:side`."""
     return item_id.partition(":")[0]
 
 
 def sides_of(dataset: str) -> tuple[str, ...]:
-    """The sides that a dataset, an arm or a variation asks of each scenario."""
+    """Return the sides that a dataset, an arm or a variation asks of each scenario."""
     controls = {*ARMS, *PANEL_DOSES} - {CROSSED}
     return ("control",) if dataset in controls else ("void",) if dataset in PANEL_LOOKS else SIDES

@@ -33,12 +33,12 @@ class Ratings:
     answer: Sequence[str]
 
     def select(self, chosen: np.ndarray) -> Ratings:
-        """The rows that a boolean mask chooses."""
+        """Return the rows that a boolean mask chooses."""
         return replace(self, answers=self.answers.loc[chosen].reset_index(drop=True), values=self.values[chosen])
 
     def on(self, items: pd.DataFrame, tasks: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """The votes on each item (rows with the columns `answer`) in that one of the tasks in which it was judged:
-        values, (items, judges), all INVALID if it was not judged; and whether it was judged, (items,)."""
+        """Return the votes on each item (rows with the columns `answer`) in that one of the tasks in which it was
+        judged: values, (items, judges), all INVALID if it was not judged; and whether it was judged, (items,)."""
         by = [*self.answer]
         judged = self.answers.loc[self.answers["task"].isin(tasks), by]
         found = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
@@ -50,8 +50,8 @@ class Ratings:
 
 
 def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Sequence[str] = ANSWER) -> Ratings:
-    """The matrix of VOTES rows (with `VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical order), or
-    of rows of another table of votes, in which the columns `answer` identify an answer.
+    """Return the matrix of VOTES rows (with `VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical
+    order), or of rows of another table of votes, in which the columns `answer` identify an answer.
 
     An answer that was not put to all of these judges is left out: another panel judged it.
     """
@@ -70,7 +70,9 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """The number of each vote's group by these columns, (votes,), and the first vote of each group, (groups,)."""
+    """Return the number of each vote's group by these columns, (votes,), and the first vote of each group,
+    (groups,).
+    """
     code = np.zeros(len(votes), np.int64)
     for name in by:
         own, known = pd.factorize(votes[name])
@@ -80,19 +82,20 @@ def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def _decisions(votes: pd.DataFrame) -> np.ndarray:
-    """YES, NO or INVALID of each vote, (votes,) int8."""
+    """Return YES, NO or INVALID of each vote, (votes,) int8."""
     decisions = votes.reindex(columns=["abstained", "correct"]).to_numpy(object)  # a table of one task has one of them
     yes = (decisions == True).astype(bool).any(axis=1)  # noqa: E712 - null compares as not true
     return np.where(votes["valid"].to_numpy(bool), yes, INVALID).astype(np.int8)
 
 
 def majority(values: np.ndarray) -> np.ndarray:
-    """The vote of more than half of the judges, (rows,) int8; INVALID where neither yes nor no has that many votes."""
+    """Return the vote of more than half of the judges, (rows,) int8; INVALID where neither yes nor no has that many
+    votes."""
     half = values.shape[1] / 2
     yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
     return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)
 
 
 def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
-    """The votes as true (YES), false (NO) and null (INVALID)."""
+    """Return the votes as true (YES), false (NO) and null (INVALID)."""
     return pd.arrays.BooleanArray(votes == YES, votes == INVALID)

@@ -47,8 +47,8 @@ PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves d
 
 
 def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
-    """The fields of the object that an answer must be under a regime, in a dataset that may vary it; None for free
-    text."""
+    """Return the fields of the object that an answer must be under a regime, in a dataset that may vary it; None for
+    free text."""
     return FIELDS.get(dataset, FIELDS.get(regime))
 
 

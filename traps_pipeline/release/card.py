@@ -20,13 +20,13 @@ _WITH_CLIPS = (PAIRS.name, RELEASED_ITEMS.name, HELD_OUT_ITEMS.name)
 
 @cache
 def environment() -> Environment:
-    """The templates of a release: plain text, of which an undefined name is an error."""
+    """Return the templates of a release: plain text, of which an undefined name is an error."""
     folder = Path(__file__).parent / "templates"
     return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, keep_trailing_newline=True)
 
 
 def card(manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
-    """The README of a released folder."""
+    """Return the README of a released folder."""
     header = {
         "pretty_name": f"{manifest['name']} {manifest['version']}",
         "language": ["en"],
@@ -54,7 +54,7 @@ def _size(rows: int) -> str:
 
 
 def dictionary(tables: Sequence[Table[Any]], places: Mapping[str, str], canary: str) -> str:
-    """The data dictionary in Markdown: each table with its key and its columns, their types and meanings."""
+    """Return the data dictionary in Markdown: each table with its key and its columns, their types and meanings."""
     parts = [f"<!-- {canary} -->\n\n# Data dictionary\n"]
     for table in tables:
         parts.append(f"\n## {table.name}\n\nOne row is {table.row}. File: `{places[table.name]}`, JSON lines. ")

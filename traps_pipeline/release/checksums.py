@@ -16,7 +16,9 @@ _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
 def released_files(folder: Path) -> list[str]:
-    """Every file below a folder that has a checksum, as a path from it, in order. Hidden files are none of it."""
+    """Return every file below a folder that has a checksum, as a path from it, in order. Hidden files are none of
+    it.
+    """
     paths = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
     names = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
     return sorted(name for name in names if name not in _OUTSIDE)
@@ -31,7 +33,7 @@ def write_checksums(folder: Path, canary: str) -> int:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """The checksum of each file by its path. Raises TrapsError naming the line that is none."""
+    """Return the checksum of each file by its path. Raises TrapsError naming the line that is none."""
     path = folder / CHECKSUMS
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -39,29 +41,29 @@ def read_checksums(folder: Path) -> dict[str, str]:
         raise TrapsError(
             f"{path}: cannot be read ({error}); give the folder that `traps publish release` wrote"
         ) from error
-    found: dict[str, str] = {}
+    checksums: dict[str, str] = {}
     for number, line in enumerate(lines, start=1):
         if line.startswith("#"):
             continue
         match = _LINE.fullmatch(line)
-        if match is None or match[2] in found or match[2].startswith("/") or ".." in Path(match[2]).parts:
+        if match is None or match[2] in checksums or match[2].startswith("/") or ".." in Path(match[2]).parts:
             raise TrapsError(f"{path}:{number}: is no checksum of a file of the folder; get the folder again")
-        found[match[2]] = match[1]
-    return found
+        checksums[match[2]] = match[1]
+    return checksums
 
 
 def altered_files(folder: Path) -> list[str]:
-    """What differs between a folder and its checksums, a sentence for each file. Raises TrapsError."""
-    said, there = read_checksums(folder), {*released_files(folder)}
+    """Return what differs between a folder and its checksums, a sentence for each file. Raises TrapsError."""
+    expected, existing = read_checksums(folder), {*released_files(folder)}
     problems = []
-    for name in sorted({*said, *there}):
-        if name not in there:
+    for name in sorted({*expected, *existing}):
+        if name not in existing:
             problems.append(f"{name}: is missing")
-        elif name not in said:
+        elif name not in expected:
             problems.append(f"{name}: has no checksum, so it was added")
         elif (folder / name).is_symlink():
             problems.append(f"{name}: is a link, not a file")
-        elif file_digest(folder / name) != said[name]:
-            same = [other for other, sha256 in said.items() if sha256 == file_digest(folder / name)]
+        elif file_digest(folder / name) != expected[name]:
+            same = [other for other, sha256 in expected.items() if sha256 == file_digest(folder / name)]
             problems.append(f"{name}: is {f'in truth {same[0]}' if same else 'altered'}")
     return problems

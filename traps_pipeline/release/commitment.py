@@ -99,12 +99,12 @@ def _made_with() -> dict[str, str]:
 
 
 def read_commitment(path: Path) -> Commitment:
-    """A commitment from its file. Raises TrapsError."""
+    """Return a commitment from its file. Raises TrapsError."""
     return _read(Commitment, path)
 
 
 def read_reveal(path: Path) -> Reveal:
-    """A reveal from its file. Raises TrapsError."""
+    """Return a reveal from its file. Raises TrapsError."""
     return _read(Reveal, path)
 
 
@@ -123,19 +123,19 @@ def _read(kind: type[Any], path: Path) -> Any:
 
 
 def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
-    """The records of a revealed benchmark: a folder of `traps benchmark sample`, or a released folder. Raises
+    """Return the records of a revealed benchmark: a folder of `traps benchmark sample`, or a released folder. Raises
     TrapsError, also for a trajectory that is not its record's."""
     from traps_pipeline.benchmark.specs import spec_of
 
     if (folder / "scenarios.jsonl").is_file():
-        path, found = folder / "scenarios.jsonl", dict[str, SceneSpec]()
+        path, revealed = folder / "scenarios.jsonl", dict[str, SceneSpec]()
         for number, line in read_lines(path):
             try:
                 spec = spec_of(json.loads(line))
             except (ValueError, KeyError, TypeError) as error:
                 raise TrapsError(f"{path}:{number}: is no record ({plain(error)[:200]}); get it again") from error
-            found[spec.scenario_id] = parse_record(spec.model_dump_json(), f"{path}:{number}")
-        return found
+            revealed[spec.scenario_id] = parse_record(spec.model_dump_json(), f"{path}:{number}")
+        return revealed
     specs = load_released(folder / "released")
     for spec in specs.values():
         path = folder / "released" / "trajectories" / f"{spec.scenario_id}.npz"
@@ -148,18 +148,18 @@ def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
 
 
 def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
-    """How records differ from those that were committed, a sentence each; the first says so of the seed."""
-    found = []
+    """Return how records differ from those that were committed, a sentence each; the first says so of the seed."""
+    problems = []
     if _sealed_seed(reveal, commitment.draws) != commitment.seed:
-        found.append("the revealed seed, number or composition is not the one that was committed")
+        problems.append("the revealed seed, number or composition is not the one that was committed")
     for id_ in sorted({*commitment.specs, *specs}):
         if id_ not in specs:
-            found.append(f"{id_}: was committed and is not there")
+            problems.append(f"{id_}: was committed and is not there")
         elif id_ not in commitment.specs:
-            found.append(f"{id_}: was not committed")
+            problems.append(f"{id_}: was not committed")
         elif _sealed_spec(reveal, specs[id_]) != commitment.specs[id_]:
-            found.append(f"{id_}: is not the record that was committed")
-    return found
+            problems.append(f"{id_}: is not the record that was committed")
+    return problems
 
 
 def drawn_again(
@@ -169,7 +169,7 @@ def drawn_again(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> dict[str, SceneSpec]:
-    """The records that the revealed seed gives here. Raises TrapsError where a family cannot be filled."""
+    """Return the records that the revealed seed gives here. Raises TrapsError where a family cannot be filled."""
     with TemporaryDirectory(prefix="traps-") as folder:
         with kept_workers():
             for family, count in commitment.draws.items():
@@ -184,12 +184,14 @@ def drawn_again(
 
 
 def same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
-    """Whether two records differ in nothing but what depends on a machine's arithmetic."""
+    """Return whether two records differ in nothing but what depends on a machine's arithmetic."""
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 
 
 def other_arithmetic(commitment: Commitment) -> str:
-    """How this machine and its libraries differ from those of the commitment, in words; empty where they do not."""
+    """Return how this machine and its libraries differ from those of the commitment, in words; empty where they do
+    not.
+    """
     here = _made_with()
     names = [name for name in here if commitment.made_with.get(name) != here[name]]
     return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)

@@ -59,8 +59,8 @@ class Content:
 
 
 def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
-    """The pairs of a study, and items of these arms. Raises TrapsError for items that are not made, for an arm without
-    items, and for a clip that is missing or not the one that its item names."""
+    """Return the pairs of a study, and items of these arms. Raises TrapsError for items that are not made, for an arm
+    without items, and for a clip that is missing or not the one that its item names."""
     items = _records(workspace, ITEMS, (*DATASETS, *arms))
     if not items:
         raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")
@@ -93,7 +93,7 @@ def _ids(items: Iterable[Mapping[str, Any]]) -> set[str]:
 
 
 def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
-    """The scenarios of the lite set that are among the items."""
+    """Return the scenarios of the lite set that are among the items."""
     return _ids(items) & {*read_yaml(LITE_FILE)["scenarios"]}
 
 
@@ -101,7 +101,7 @@ def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
 
 
 def pair_rows(content: Content) -> list[PairRow]:
-    """A row a pair, in the order of their ids. Raises TrapsError for a pair of which a side is missing."""
+    """Return a row a pair, in the order of their ids. Raises TrapsError for a pair of which a side is missing."""
     lite, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
     for row in content.items:
         if row["dataset"] in DATASETS:
@@ -129,7 +129,7 @@ def pair_rows(content: Content) -> list[PairRow]:
 
 
 def item_rows(content: Content) -> list[ReleasedItemRow]:
-    """A row an item, in the order of their ids."""
+    """Return a row an item, in the order of their ids."""
     lite = lite_of(content.items)
     return [
         ReleasedItemRow(
@@ -143,7 +143,7 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
-    """A row an item, without what tells its answer, in the order of names that tell nothing."""
+    """Return a row an item, without what tells its answer, in the order of names that tell nothing."""
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
@@ -158,17 +158,17 @@ def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
 
 
 def held_out_clip(media_digest: str) -> str:
-    """Path of a clip in a folder without answers: its name is its content."""
+    """Return path of a clip in a folder without answers: its name is its content."""
     return f"{_CLIPS}{media_digest[:2]}/{media_digest[:32]}.mp4"
 
 
 def scenario_rows(content: Content) -> list[ScenarioRow]:
-    """A row a scenario: its whole record."""
+    """Return a row a scenario: its whole record."""
     return [ScenarioRow(**row, canary=content.release.canary) for row in content.specs]
 
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
-    """A row for each certificate of each scenario, judged by the numbers that its record stores."""
+    """Return a row for each certificate of each scenario, judged by the numbers that its record stores."""
     return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content.release.canary)]
 
 
@@ -195,7 +195,7 @@ def _certificates(spec: SceneSpec, canary: str) -> Iterable[CertificateRow]:
 
 
 def split_rows(content: Content) -> list[SplitRow]:
-    """A row for each scenario of each split."""
+    """Return a row for each scenario of each split."""
     splits = {"lite": lite_of(content.items), "test": _ids(content.items)}
     return [
         SplitRow(split=name, scenario_id=id_, canary=content.release.canary)
@@ -205,7 +205,7 @@ def split_rows(content: Content) -> list[SplitRow]:
 
 
 def prompt_rows(canary: str) -> list[PromptRow]:
-    """A row for the system prompt of each regime, and for each of the panel's tasks."""
+    """Return a row for the system prompt of each regime, and for each of the panel's tasks."""
     texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
     texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
     texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}

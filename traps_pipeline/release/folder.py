@@ -180,7 +180,7 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
 
 
 def _about(content: Content) -> dict[str, Any]:
-    """Name, version and canary of what is released, and the version of each dataset."""
+    """Return name, version and canary of what is released, and the version of each dataset."""
     return {**content.release.model_dump(), "versions": content.versions}
 
 
@@ -196,7 +196,7 @@ ANONYMOUS_CITATION = {
 
 
 def identifying() -> dict[str, str]:
-    """What tells who made the benchmark, and what stands in its place for double-blind review."""
+    """Return what tells who made the benchmark, and what stands in its place for double-blind review."""
     data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
     names = [f"{one['given-names']} {one['family-names']}" for one in paper["authors"]]
@@ -206,7 +206,7 @@ def identifying() -> dict[str, str]:
 
 
 def anonymous(text: str) -> str:
-    """A text without what tells who made the benchmark, wherever lines are broken."""
+    """Return a text without what tells who made the benchmark, wherever lines are broken."""
     for words, instead in identifying().items():
         text = re.sub(r"\s+".join(map(re.escape, words.split())), instead, text)
     return text

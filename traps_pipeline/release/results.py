@@ -44,7 +44,7 @@ class Who:
     developer: str = "unknown"
 
     def made(self, model: str) -> str:
-        """Who made a model."""
+        """Return who made a model."""
         return OURS if is_reference(model) else self.developer
 
 

@@ -37,8 +37,8 @@ def sign(folder: Path, private_key: Path) -> Path:
 
 
 def check_signature(folder: Path, public_key: Path) -> str:
-    """What is wrong with the signature of a folder, in words; empty where it is that of the key over these very files.
-    Raises TrapsError where the library or the signature is missing."""
+    """Return what is wrong with the signature of a folder, in words; empty where it is that of the key over these very
+    files. Raises TrapsError where the library or the signature is missing."""
     library, path = _library(), folder / SIGNATURE
     if not path.is_file():
         raise TrapsError(f"{path}: is missing, so that there is nothing to verify; leave --key out")

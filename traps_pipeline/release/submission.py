@@ -89,7 +89,7 @@ class Submission:
     altered: tuple[str, ...]
 
     def table(self, table: Table[Any]) -> pd.DataFrame:
-        """The rows of one of its tables."""
+        """Return the rows of one of its tables."""
         return self.tables[f"{table.name}.parquet"]
 
 
@@ -135,33 +135,33 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
 
 
 def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
-    """The rows of a table as Parquet, in the order of its key: equal rows give equal bytes."""
+    """Return the rows of a table as Parquet, in the order of its key: equal rows give equal bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     data = pa.Table.from_pandas(frame, schema=table.arrow_schema(), preserve_index=False)
     data = data.replace_schema_metadata(None).sort_by([(name, "ascending") for name in table.key])
-    made = io.BytesIO()
-    pq.write_table(data, made, compression="zstd")
-    return made.getvalue()
+    buffer = io.BytesIO()
+    pq.write_table(data, buffer, compression="zstd")
+    return buffer.getvalue()
 
 
 def _zipped(content: Mapping[str, bytes]) -> bytes:
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as archive:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in content.items():
             entry = zipfile.ZipInfo(name, date_time=_DATE)
             entry.create_system, entry.external_attr = 3, 0o644 << 16
             archive.writestr(entry, data, zipfile.ZIP_STORED)
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def read_submission(path: Path) -> Submission:
-    """A submission from its file. Raises TrapsError for a file that is none: other names, too large, compressed as a
-    whole, other columns, or text where a table should be."""
+    """Return a submission from its file. Raises TrapsError for a file that is none: other names, too large, compressed
+    as a whole, other columns, or text where a table should be."""
     try:
         size = path.stat().st_size
         if size > MOST_FILE_BYTES:
@@ -185,9 +185,9 @@ def read_submission(path: Path) -> Submission:
 
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
     entries = archive.infolist()
-    wanted = sorted([ABOUT, *TABLES])
-    if sorted(entry.filename for entry in entries) != wanted:
-        raise TrapsError(f"{path}: is no submission: it holds other files than {', '.join(wanted)}")
+    expected = sorted([ABOUT, *TABLES])
+    if sorted(entry.filename for entry in entries) != expected:
+        raise TrapsError(f"{path}: is no submission: it holds other files than {', '.join(expected)}")
     for entry in entries:
         # Stored, so that no entry can be larger than the file; Parquet compresses its own columns.
         if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
@@ -200,23 +200,23 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
-    """A table whose size was looked at before it is unpacked, and whose columns are those of this version."""
+    """Return a table whose size was looked at before it is unpacked, and whose columns are those of this version."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     table = TABLES[file]
     try:
-        found = pq.ParquetFile(pa.BufferReader(content))
-        groups = [found.metadata.row_group(i) for i in range(found.metadata.num_row_groups)]
-        if found.metadata.num_rows > MOST_ROWS or sum(g.total_byte_size for g in groups) > MOST_TABLE_BYTES:
-            raise TrapsError(f"{path}: {file} is too large ({found.metadata.num_rows} rows)")
-        wanted = table.arrow_schema()
-        if found.schema_arrow.names != wanted.names or found.schema_arrow.types != wanted.types:
+        parquet = pq.ParquetFile(pa.BufferReader(content))
+        groups = [parquet.metadata.row_group(i) for i in range(parquet.metadata.num_row_groups)]
+        if parquet.metadata.num_rows > MOST_ROWS or sum(g.total_byte_size for g in groups) > MOST_TABLE_BYTES:
+            raise TrapsError(f"{path}: {file} is too large ({parquet.metadata.num_rows} rows)")
+        schema = table.arrow_schema()
+        if parquet.schema_arrow.names != schema.names or parquet.schema_arrow.types != schema.types:
             raise TrapsError(f"{path}: {file} has other columns than this version's; pack it again, or verify it there")
-        data = found.read()
+        data = parquet.read()
     except (pa.ArrowException, OSError, ValueError) as error:
         raise TrapsError(f"{path}: {file} is no readable table ({plain(error)[:200]}); pack it again") from error
-    for column in wanted:
+    for column in schema:
         if not column.nullable and data[column.name].null_count:
             raise TrapsError(f"{path}: {file}: column {column.name} has missing values")
     keys = data.select(list(table.key)).to_pandas()

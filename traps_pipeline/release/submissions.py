@@ -127,7 +127,7 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
 
 
 def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
-    """The members' verdicts scored together, so that their differences are paired over the same scenarios."""
+    """Return the members' verdicts scored together, so that their differences are paired over the same scenarios."""
     owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
     for one in members:
@@ -149,13 +149,13 @@ def _verdicts(one: Accepted) -> pd.DataFrame:
 
 def write_board(board: Board, folder: Path) -> None:
     """Write the page, and all its rows as Parquet."""
-    shown: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for group in board.groups:
         tables = [(table.title, table_html(table)) for table in leaderboards(group.board)]
-        shown.append({"title": group.title, "tables": tables})
+        entries.append({"title": group.title, "tables": tables})
     page = environment().get_template("submissions.html.j2")
     terms = legend(pd.concat([group.board for group in board.groups], ignore_index=True))
-    html = page.render(title=TITLE, groups=shown, accepted=board.accepted, refused=board.refused, legend=terms)
+    html = page.render(title=TITLE, groups=entries, accepted=board.accepted, refused=board.refused, legend=terms)
     write_bytes(folder / TABLE, _parquet(board))
     write_text(folder / PAGE, html)
 

@@ -55,9 +55,9 @@ class Verified:
     verdicts: pd.DataFrame | None = None
     scored: Scored | None = None
 
-    def look(self, what: str, found: Iterator[str]) -> None:
+    def look(self, what: str, complaints: Iterator[str]) -> None:
         """Note a check, and its problems, of which the first are kept and the others counted."""
-        problems = list(found)
+        problems = list(complaints)
         self.checked.append(what)
         self.problems += problems[:SHOWN]
         if len(problems) > SHOWN:
@@ -67,26 +67,26 @@ class Verified:
 def verify(submission: Submission, release: Path | None = None) -> Verified:
     """Verify a submission, against a released folder if one is given. Raises TrapsError for a release that cannot be
     read."""
-    found = Verified()
+    verified = Verified()
     items = {row["item_id"]: row for row in _records(submission.table(ITEMS))}
     answers, votes = _records(submission.table(RESPONSES)), _records(submission.table(VOTES))
-    found.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
-    found.look("items", _wrong_items(items.values()))
-    found.look("prompts", _wrong_prompts(submission))
-    found.look("answers", _wrong_answers(answers, items))
-    found.look("panel", _wrong_panel(submission, votes))
+    verified.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
+    verified.look("items", _wrong_items(items.values()))
+    verified.look("prompts", _wrong_prompts(submission))
+    verified.look("answers", _wrong_answers(answers, items))
+    verified.look("panel", _wrong_panel(submission, votes))
     by_rules = all(seat.backend == RULE for seat in submission.about.judges)
-    found.look("votes", _wrong_votes(submission, votes, answers, items))
-    _numbers(found, submission)
+    verified.look("votes", _wrong_votes(submission, votes, answers, items))
+    _numbers(verified, submission)
     if release is None:
-        found.unchecked.append("items and clips against a release: name its folder with --release")
+        verified.unchecked.append("items and clips against a release: name its folder with --release")
     else:
-        found.look("items and clips against the release", _strangers(items, release))
-    found.unchecked.append("that the answers are the model's: only who asked it knows")
-    found.unchecked.append("that the clips named by digest are those that the model was sent")
+        verified.look("items and clips against the release", _strangers(items, release))
+    verified.unchecked.append("that the answers are the model's: only who asked it knows")
+    verified.unchecked.append("that the clips named by digest are those that the model was sent")
     if not by_rules:
-        found.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
-    return found
+        verified.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
+    return verified
 
 
 def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
@@ -110,17 +110,17 @@ def _wrong_items(items: Any) -> Iterator[str]:
 
 
 def _wrong_prompts(submission: Submission) -> Iterator[str]:
-    for regime, said in submission.about.prompts.items():
+    for regime, stated in submission.about.prompts.items():
         if regime not in REGIMES:
             yield f"regime {regime[:40]!r}: is unknown"
-        elif said != prompt_version(regime):
+        elif stated != prompt_version(regime):
             yield f"regime {regime}: was asked with another prompt than this version's"
     for regime in sorted({*submission.table(RESPONSES)["regime"]} - {*submission.about.prompts}):
         yield f"regime {str(regime)[:40]!r}: was asked with a prompt that is not named"
 
 
 def released_items(release: Path) -> dict[str, tuple[str, str]]:
-    """Digests of item and clip of each item of a released folder. Raises TrapsError, also where the folder was
+    """Return digests of item and clip of each item of a released folder. Raises TrapsError, also where the folder was
     altered."""
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
@@ -128,15 +128,15 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
     altered = altered_files(release)
     if altered:
         raise TrapsError(f"{release}: is not what was released: {altered[0]}")
-    found = {}
+    items = {}
     for number, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row = json.loads(line)
         if "item_hash" not in row:
             raise TrapsError(f"{release}: is a held-out set; verify against the open release")
-        found[row["item_id"]] = row["item_hash"], row["media_digest"]
+        items[row["item_id"]] = row["item_hash"], row["media_digest"]
         if row["dataset"] in DATASETS and item_hash(row) != row["item_hash"]:
             raise TrapsError(f"{release}: line {number} of its items is not what its digest says")
-    return found
+    return items
 
 
 def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
@@ -175,11 +175,11 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
             yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
         elif row["outcome"] in JUDGED and (why := degenerate(text)):
             yield f"answer of {_named(row)}: {why}, so it is none"
-    wanted = dict[str, set[str]]()
+    expected = dict[str, set[str]]()
     for id_, item in items.items():
-        wanted.setdefault(item["dataset"], set()).add(id_)
+        expected.setdefault(item["dataset"], set()).add(id_)
     for (dataset, model, regime, run), ids in asked.items():
-        for id_ in sorted(wanted[dataset] - ids):
+        for id_ in sorted(expected[dataset] - ids):
             yield f"answer of {model} ({regime}, run {run}) on {id_}: is missing"
 
 
@@ -224,8 +224,8 @@ def _wrong_votes(
             yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {wrong}"
     for key, row in texts.items():
         item = items.get(row["item_id"])
-        wanted = {(task, judge) for task in tasks_for(item["side"]) for judge in seats} if item else set()
-        for task, judge in sorted(wanted - cast.get(key, set())):
+        expected = {(task, judge) for task in tasks_for(item["side"]) for judge in seats} if item else set()
+        for task, judge in sorted(expected - cast.get(key, set())):
             yield f"vote of {judge} on {task} of {_named(row)}: is missing"
 
 
@@ -236,12 +236,13 @@ def _rules_on(task: str, user: str) -> Outcome:
 
 
 def _cast_again(request: Request) -> Outcome:
-    """What the rules make of a request: they read its text and its task alone."""
+    """Return what the rules make of a request: they read its text and its task alone."""
     return _rules_on(str(request.about["task"]), request.user)
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """How a vote differs from what it must be; an item whose truth is of another kind than it says decides nothing."""
+    """Return how a vote differs from what it must be; an item whose truth is of another kind than it says decides
+    nothing."""
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:
@@ -249,14 +250,14 @@ def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _difference(row: Row, item: Row, again: Outcome | None) -> str:
-    """How a vote differs from what it must be, in words; empty where it does not."""
+    """Return how a vote differs from what it must be, in words; empty where it does not."""
     decision = "abstained" if row["task"] == "abstention" else "correct"
     if again is not None:
         vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
-        said = {decision: vote.decision}
-        said |= {name: getattr(vote, name) for name in ("extracted_value", "valid", "invalid_reason")}
-        wrong = [name for name, value in said.items() if row[name] != value]
-        return f"{wrong[0]} is {row[wrong[0]]!r:.40}, its rules say {said[wrong[0]]!r:.40}" if wrong else ""
+        expected = {decision: vote.decision}
+        expected |= {name: getattr(vote, name) for name in ("extracted_value", "valid", "invalid_reason")}
+        wrong = [name for name, value in expected.items() if row[name] != value]
+        return f"{wrong[0]} is {row[wrong[0]]!r:.40}, its rules say {expected[wrong[0]]!r:.40}" if wrong else ""
     if not row["valid"]:
         return "is invalid and decides nothing, yet has a decision" if row[decision] is not None else ""
     if row[decision] is None:
@@ -271,7 +272,7 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def _numbers(found: Verified, submission: Submission) -> None:
+def _numbers(verified: Verified, submission: Submission) -> None:
     """Verdicts, metrics and leaderboard again from the votes, and how the submission's numbers differ from them."""
     own = id_of_seats(submission.about.panel, submission.about.judges)
     try:
@@ -281,17 +282,17 @@ def _numbers(found: Verified, submission: Submission) -> None:
         verdicts = decide(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
             {"panel": own}
         )
-        found.verdicts, found.scored = verdicts, score(verdicts)
+        verified.verdicts, verified.scored = verdicts, score(verdicts)
     except (TrapsError, ValueError, KeyError, TypeError) as error:
-        found.problems.append(f"no number can be computed: {error}")
+        verified.problems.append(f"no number can be computed: {error}")
         return
-    found.look("metrics", _other_numbers(METRICS, submission.table(METRICS), found.scored.metrics))
-    found.look("leaderboard", _other_numbers(LEADERBOARD, submission.table(LEADERBOARD), found.scored.board))
+    verified.look("metrics", _other_numbers(METRICS, submission.table(METRICS), verified.scored.metrics))
+    verified.look("leaderboard", _other_numbers(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
 
 
-def _other_numbers(table: Table[Any], said: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
+def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
-    theirs, ours = ({tuple(row[k] for k in key): row for row in _records(frame)} for frame in (said, own))
+    theirs, ours = ({tuple(row[k] for k in key): row for row in _records(frame)} for frame in (stated, own))
     for entry in sorted({*theirs, *ours}, key=str):
         name = f"{table.name} {' '.join(map(str, entry))}"
         if entry not in ours or entry not in theirs:

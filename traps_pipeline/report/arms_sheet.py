@@ -38,8 +38,8 @@ class Row:
 
 
 def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, Figure]:
-    """`arms_<taxonomy>` of the scenario of each taxonomy that admits most arms (of several, the first by id), and
-    `panels_occlusion` of that which admits most looks of the panel.
+    """Return `arms_<taxonomy>` of the scenario of each taxonomy that admits most arms (of several, the first by id),
+    and `panels_occlusion` of that which admits most looks of the panel.
 
     items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No figure where nothing was filmed. Raises
     DamagedClip when a clip cannot be decoded.
@@ -60,12 +60,12 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
 
 
 def _moments(clip: Path) -> np.ndarray:
-    """Times (MOMENTS,) in seconds that tell what a control shows."""
+    """Return times (MOMENTS,) in seconds that tell what a control shows."""
     return telling_times(*decode(clip), MOMENTS)
 
 
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
-    """Control and void, then the arms that must be answered, then those that must be abstained on."""
+    """Yield control and void, then the arms that must be answered, then those that must be abstained on."""
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
     own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
     for row in (*pair.to_dict("records"), *own.to_dict("records")):
@@ -78,7 +78,7 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
-    """A row a clip, its words on the left, frames at the control's times, hatched behind its end."""
+    """Return a row a clip, its words on the left, frames at the control's times, hatched behind its end."""
     _, tall, wide, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * tall / wide + GAP_IN
     width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in
@@ -107,7 +107,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
 
 
 def _own_words(row: Row, control: Row) -> list[str]:
-    """The question of a row that asks other words than the control."""
+    """Return the question of a row that asks other words than the control."""
     if row.question == control.question:
         return []
     return textwrap.wrap(f"“{row.question}”", 46, max_lines=3, placeholder=" …")

@@ -84,8 +84,8 @@ class TableReport:
         return self.paper is not None or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """The tables; of the paper, those recomputed from its numbers, without columns that have no figure. They are
-        made once for a set of results: for their own files and for the page."""
+        """Return the tables; of the paper, those recomputed from its numbers, without columns that have no figure. They
+        are made once for a set of results: for their own files and for the page."""
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -93,24 +93,24 @@ class TableReport:
     def _tables(self, results: Results) -> list[PrintedTable]:
         if not results.is_study and not self.recomputed:
             return []
-        said = [results.judged_by] if _is_judged(self.reads) else []
+        remarks = [results.judged_by] if _is_judged(self.reads) else []
         shown = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
-        made = [replace(table, columns=columns, notes=[*said, *table.notes]) for table, columns in shown]
-        return [table for table in made if results.is_study or table.name in self.recomputed]
+        tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in shown]
+        return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """The paper's own tables."""
+        """Return the paper's own tables."""
         return self.paper() if self.paper else []
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Files by path: `tables/name.csv` and so on; for the paper, its tables as printed in `tables/published` and
-        what follows from them in `tables/recomputed`."""
+        """Return files by path: `tables/name.csv` and so on; for the paper, its tables as printed in `tables/published`
+        and what follows from them in `tables/recomputed`."""
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
             parts = {f"tables/{PAPER}": self.as_printed(), f"tables/{RECOMPUTED}": self.tables(results)}
-        made = [(folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()]
-        return {f"{folder}/{name}": content for folder, (name, content) in made}
+        named = [(folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()]
+        return {f"{folder}/{name}": content for folder, (name, content) in named}
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class FigureReport:
         return f"{self.finding(results)} {self.doc}".strip()
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """PDF, SVG and PNG by path; none if the figure was not run."""
+        """Return PDF, SVG and PNG by path; none if the figure was not run."""
         try:
             files = figure_files(self.name, self.figure(results))
         except NotRun:
@@ -142,8 +142,8 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """The figure; where its numbers are not comparable it says so itself, since pictures lose their captions.
-        Raises NotRun where it has no data."""
+        """Return the figure; where its numbers are not comparable it says so itself, since pictures lose their
+        captions. Raises NotRun where it has no data."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
@@ -239,7 +239,7 @@ INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patchi
 
 
 def folder(kind: str, results: Results) -> str:
-    """The folder of a kind, `tables` or `figures`; the paper's files are in a folder below it."""
+    """Return the folder of a kind, `tables` or `figures`; the paper's files are in a folder below it."""
     return kind if results.is_study else f"{kind}/{PAPER}"
 
 
@@ -260,7 +260,7 @@ def _say_below(figure: Figure, text: str) -> None:
 
 
 def _is_judged(reads: Sequence[str]) -> bool:
-    """Whether a report shows numbers that a panel decided, by the stages that it reads."""
+    """Return whether a report shows numbers that a panel decided, by the stages that it reads."""
     return bool({*reads} & JUDGED_STAGES)
 
 

@@ -85,8 +85,8 @@ def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figu
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
-    """ITEMS rows of six visual pairs for a figure like the paper's: three of each taxonomy, no two of one sub-scenario
-    and of different categories where possible; fewer if there are fewer sub-scenarios."""
+    """Return ITEMS rows of six visual pairs for a figure like the paper's: three of each taxonomy, no two of one
+    sub-scenario and of different categories where possible; fewer if there are fewer sub-scenarios."""
     visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     chosen: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
@@ -98,15 +98,16 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
-    """The pairs that have both sides, occlusion first, as frames of two rows indexed by side."""
+    """Return the pairs that have both sides, occlusion first, as frames of two rows indexed by side."""
     whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
     whole = whole.assign(place=whole["dataset"].map(DATASETS.index)).sort_values(["place", "sub_scenario", "pair_id"])
     return [pair.set_index("side") for _, pair in whole.groupby("pair_id", sort=False)]
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Control, void and the times (moments,) in seconds, from the control's first frame to its last. Of a control that
-    a panel closes they end with the last frame that shows its outcome, and, where there is room, the very last one."""
+    """Return control, void and the times (moments,) in seconds, from the control's first frame to its last. Of a
+    control that a panel closes they end with the last frame that shows its outcome, and, where there is room, the very
+    last one."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, at, moments)
@@ -114,15 +115,15 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
-    """Times (moments,) from the first to the last of a clip's, `at`; where a panel closes the clip (frames, RGB), to
-    the last one before it comes, and if there are four or more, the clip's last one too."""
+    """Return times (moments,) from the first to the last of a clip's, `at`; where a panel closes the clip (frames,
+    RGB), to the last one before it comes, and if there are four or more, the clip's last one too."""
     seen = len(before_panel(frames))
     closed = [len(at) - 1] if seen < len(at) and moments > 3 else []
     return at[np.append(np.linspace(0, seen - 1, moments - len(closed)).round(), closed).astype(int)]
 
 
 def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
-    """The frames nearest to the times; a clip ends one frame after its last frame begins."""
+    """Return the frames nearest to the times; a clip ends one frame after its last frame begins."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
     nearest = np.abs(at[:, None] - times).argmin(axis=0)
@@ -130,7 +131,7 @@ def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledCli
 
 
 def ratio_of(clip: SampledClip) -> float:
-    """Height over width of a pair's block of frames."""
+    """Return height over width of a pair's block of frames."""
     moments, height, width, _ = clip.frames.shape
     return (2 * height + GAP) / (moments * width + (moments - 1) * GAP)
 
@@ -194,7 +195,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The frame resized to the control's size, so that a void clip of another size does not break the sheet."""
+    """Return the frame resized to the control's size, so that a void clip of another size does not break the sheet."""
     if frame.shape[:2] == (height, width):
         return frame
     import cv2

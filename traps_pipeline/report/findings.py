@@ -29,7 +29,9 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def states_and_output(results: Results) -> str:
-    """How many voids that were answered states and output put among voids, and how well either orders the sides."""
+    """Return how many voids that were answered states and output put among voids, and how well either orders the
+    sides.
+    """
     sentences = list[str]()
     for model, of in _models(scored_items(results)):
         voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
@@ -91,7 +93,7 @@ def probe_baselines(results: Results) -> str:
 
 
 def gate_arrows(results: Results) -> str:
-    """What the default gate does to PECS, beside the best gate on anything else than states."""
+    """Return what the default gate does to PECS, beside the best gate on anything else than states."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     sentences = list[str]()
@@ -110,7 +112,7 @@ def gate_arrows(results: Results) -> str:
 
 
 def doses_among_nulls(results: Results) -> str:
-    """Where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
+    """Return where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
     rows = results.nulls
     sentences = list[str]()
     for model, of in _models(rows.loc[rows["target"] != "all"]):
@@ -136,7 +138,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def patching(results: Results) -> str:
-    """The group of positions that carries most of the difference at the first layer and at the last."""
+    """Return the group of positions that carries most of the difference at the first layer and at the last."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     sentences = list[str]()

@@ -110,14 +110,14 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
-    """LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first; one table for each
-    panel. said: further notes."""
+    """Return LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first; one table
+    for each panel. said: further notes."""
     return "\n".join(table_text(table) for table in ranked_tables(board, robust, said))
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
-    """LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first. said: further
-    notes."""
+    """Return LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first. said:
+    further notes."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
     return "\n".join([*(table_markdown(table) for table in ranked_tables(board, robust, said)), *terms]) + "\n"
 
@@ -125,7 +125,7 @@ def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None
 def ranked_tables(
     board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
 ) -> list[PrintedTable]:
-    """The brief table that ranks the entries of each panel. said: further notes of the first."""
+    """Return the brief table that ranks the entries of each panel. said: further notes of the first."""
     return _with_notes([_of_one_panel(part, robust, True, suffix)[0] for suffix, part in _by_panel(board)], said)
 
 
@@ -137,8 +137,9 @@ def _with_notes(tables: list[PrintedTable], said: Sequence[str]) -> list[Printed
 def leaderboards(
     board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
 ) -> list[PrintedTable]:
-    """Tables of LEADERBOARD rows for each panel, whose entries are never ranked together: first the one that ranks the
-    entries, then one for each other dataset. The overall table has the figures of ROBUST rows, if there are any.
+    """Return tables of LEADERBOARD rows for each panel, whose entries are never ranked together: first the one that
+    ranks the entries, then one for each other dataset. The overall table has the figures of ROBUST rows, if there are
+    any.
 
     The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
     without a row in it comes last. said: further notes of the first table.
@@ -148,7 +149,9 @@ def leaderboards(
 
 
 def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """The rows by panel, with what tells the names of their tables apart; entries of several panels come last."""
+    """Return the rows by panel, with what tells the names of their tables apart; entries of several panels come
+    last.
+    """
     if board.empty:
         return [("", board)]
     of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
@@ -171,7 +174,7 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
-    """The entries of LEGEND for the columns and marks that the board has."""
+    """Return the entries of LEGEND for the columns and marks that the board has."""
     needed = {column.heading: field for column, field in OPTIONAL.items()}
     needed |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
@@ -180,7 +183,7 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
 
 
 def provenance(board: pd.DataFrame) -> str:
-    """A sentence that names the panels, benchmark versions and epochs of the board's figures."""
+    """Return a sentence that names the panels, benchmark versions and epochs of the board's figures."""
     versions = _distinct(board["benchmark_version"].unique(), " + ")
     epochs = _distinct(board["epoch"].unique(), "+")
     return (
@@ -190,16 +193,16 @@ def provenance(board: pd.DataFrame) -> str:
 
 
 def judged_by(board: pd.DataFrame) -> str:
-    """A sentence that names the panels that judged, and says where their figures are not comparable."""
+    """Return a sentence that names the panels that judged, and says where their figures are not comparable."""
     panels = _distinct(board["panel"].unique(), "+")
     names = [_panel_in_words(panel) for panel in panels]
     several = len(panels) > 1
-    said = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
-    said += "; figures of different panels are not ranked or compared" * several
+    sentence = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
+    sentence += "; figures of different panels are not ranked or compared" * several
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
     others = sorted({model for panel, model in rows if by_rules(panel, model)})
-    shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-    return f"{said}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {shown}." if others else "")
+    names_shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
+    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if others else "")
 
 
 def _panel_in_words(panel: str) -> str:
@@ -243,14 +246,16 @@ def _leaderboard(
 
 
 def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
-    """The rows with ROBUST_COLUMNS as printed."""
-    found = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
+    """Return the rows with ROBUST_COLUMNS as printed."""
+    robust_rows = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
     printed = {"conjunction": percent, "robust": fraction, "inference_acc": percent}
-    return rows.assign(**{name: [as_(row[name]) if row else NOT_RUN for row in found] for name, as_ in printed.items()})
+    return rows.assign(
+        **{name: [as_(row[name]) if row else NOT_RUN for row in robust_rows] for name, as_ in printed.items()}
+    )
 
 
 def _notes_on_arms(beside: Robust) -> list[str]:
-    """Notes that name the arms of each entry, and the reasons why pairs and arms are not joined."""
+    """Return notes that name the arms of each entry, and the reasons why pairs and arms are not joined."""
     entries: dict[tuple[str, ...], list[str]] = {}
     for (model, regime), row in beside.items():
         entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
@@ -269,9 +274,9 @@ def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """One row per (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, and marks. For
-    an entry without a row of the dataset the counts are sums over all its rows."""
-    found, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
+    """Return one row per (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, and
+    marks. For an entry without a row of the dataset the counts are sums over all its rows."""
+    rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in of_several_runs(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
     for by_dataset in entries.values():
@@ -289,7 +294,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         for name in others:
             row = by_dataset.get(name)
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
-        found.append(entry)
+        rows.append(entry)
     own = [column.name for column in LEADERBOARD.columns]
     marks = [
         "mark",
@@ -301,11 +306,11 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         *others,
         *(f"{name}_mark" for name in others),
     ]
-    return pd.DataFrame(sorted(found, key=_rank), columns=pd.Index([*own, *marks]))
+    return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*own, *marks]))
 
 
 def _mark(row: Mapping[str, Any]) -> str:
-    """The marks of a PECS: that too little is answered, that what is answered is broken."""
+    """Return the marks of a PECS: that too little is answered, that what is answered is broken."""
     return (INCOMPLETE_MARK if row["incomplete"] else "") + (BROKEN_MARK if row["is_broken"] else "")
 
 

@@ -15,7 +15,8 @@ _FLAGS = ("own_best", "all_sample_best", "chosen")
 
 
 def published_probes() -> pd.DataFrame:
-    """PROBES rows: transfer, and confabulated (at the layer of the transfer value, since the paper names no other)."""
+    """Return PROBES rows: transfer, and confabulated (at the layer of the transfer value, since the paper names no
+    other)."""
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"}).assign(scope="all")
     transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
     confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
@@ -24,7 +25,9 @@ def published_probes() -> pd.DataFrame:
 
 
 def published_cosines() -> pd.DataFrame:
-    """COSINES rows: the matrix of qwen3-vl-8b, and the few values of the other two models in the paper's text."""
+    """Return COSINES rows: the matrix of qwen3-vl-8b, and the few values of the other two models in the paper's
+    text.
+    """
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
     other_figures = published("other")
     other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")].reset_index(
@@ -39,7 +42,7 @@ def published_cosines() -> pd.DataFrame:
 
 
 def published_effects() -> pd.DataFrame:
-    """STEERING_EFFECTS rows of the dose-response tables, with the regimes that their captions state."""
+    """Return STEERING_EFFECTS rows of the dose-response tables, with the regimes that their captions state."""
     qwen = published("steering_dose_qwen").assign(model="qwen3-vl-8b", epoch="original")
     gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
     rows = _long(pd.concat([qwen, gemma], ignore_index=True))

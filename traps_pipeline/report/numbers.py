@@ -25,5 +25,5 @@ def as_numbers(values: pd.Series) -> pd.Series:
         return values
     scale = 100.0 if matches[0] and matches[0][2] and not str(values.name).endswith("_pct") else 1.0
     figures = [None if t is None else float(t.removesuffix("%").replace("−", "-")) / scale for t in texts]
-    whole = scale == 1.0 and all(figure is None or figure.is_integer() for figure in figures)
-    return pd.Series(figures, values.index, "Int64" if whole and None not in figures else "Float64", values.name)
+    are_integers = scale == 1.0 and all(figure is None or figure.is_integer() for figure in figures)
+    return pd.Series(figures, values.index, "Int64" if are_integers and None not in figures else "Float64", values.name)

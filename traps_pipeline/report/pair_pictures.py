@@ -121,5 +121,5 @@ def _readable(make: Callable[[], T]) -> T:
 
 
 def _as_json(rows: pd.DataFrame) -> str:
-    """The rows without the benchmark's version, which a correction changes in rows that it does not touch."""
+    """Return the rows without the benchmark's version, which a correction changes in rows that it does not touch."""
     return str(rows.drop(columns=["benchmark_version"], errors="ignore").to_json(orient="records"))

@@ -84,7 +84,7 @@ def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
     """Return the report page, the leaderboard as Markdown and as JSON lines, by path. cards: with their chapters."""
-    said = said_by_people(study.human_row, study.panel_errors)
+    remarks = said_by_people(study.human_row, study.panel_errors)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
         [replace(card, paper=paper.get(card.name, "")) for chapter, card in cards if chapter == name]
@@ -92,15 +92,15 @@ def report_files(
     )
     page = report_html(
         study.board, figures, pictures, tables, findings=study_findings(study), address=address,
-        explorer=EXPLORER if address else "", robust=study.robust, said=said,
+        explorer=EXPLORER if address else "", robust=study.robust, said=remarks,
         terms=INSIDE_TERMS if study.mechanism else None,
     )  # fmt: skip
-    markdown = leaderboard_markdown(study.board, study.robust, said)
+    markdown = leaderboard_markdown(study.board, study.robust, remarks)
     return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
 
 
 def metrics_lines(board: pd.DataFrame) -> str:
-    """LEADERBOARD rows as JSON lines, which experiment trackers read; a figure that is null is null there."""
+    """Return LEADERBOARD rows as JSON lines, which experiment trackers read; a figure that is null is null there."""
     return str(board.to_json(orient="records", lines=True, double_precision=15))
 
 
@@ -137,7 +137,7 @@ def _exported(sources: Sources, say: Callable[[str], None]) -> Iterator[tuple[st
 
 
 def _index(paths: Sequence[str]) -> str:
-    """A page of links to all files, by folder and name."""
+    """Return a page of links to all files, by folder and name."""
     folders: dict[str, dict[str, list[str]]] = {}
     for path in paths:
         folder, _, name = path.rpartition("/")

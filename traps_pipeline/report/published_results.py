@@ -28,7 +28,7 @@ def _cells(results: Results) -> pd.DataFrame:
 
 
 def _overall(results: Results) -> pd.DataFrame:
-    """Recomputed from the printed per-dataset cells."""
+    """Return recomputed from the printed per-dataset cells."""
     cells = results.cells
     means = analyses.overall(cells).assign(j=lambda rows: rows["abs_rec"] - rows["false_abs"])
     counts = cells.groupby(["model", "regime"]).agg(
@@ -38,7 +38,7 @@ def _overall(results: Results) -> pd.DataFrame:
 
 
 def _rates(results: Results) -> pd.DataFrame:
-    """Printed rates, their means over taxonomies, and the gaps of both."""
+    """Return printed rates, their means over taxonomies, and the gaps of both."""
     rows = published("visual_vs_textual")
     parts = []
     for taxonomy in analyses.TAXONOMIES:
@@ -54,7 +54,7 @@ def _rates(results: Results) -> pd.DataFrame:
 
 
 def _none(*columns: str) -> pd.DataFrame:
-    """A frame without rows, where nothing follows from the paper's tables beyond what they print."""
+    """Return a frame without rows, where nothing follows from the paper's tables beyond what they print."""
     return pd.DataFrame(columns=pd.Index(columns))
 
 

@@ -177,14 +177,14 @@ class Results:
         self.refused: dict[str, list[str]] = {}
 
     def rows(self, table: Table) -> pd.DataFrame:
-        """All rows of a table of a study; for the paper, a frame without rows."""
+        """Return all rows of a table of a study; for the paper, a frame without rows."""
         import pandas as pd
 
         return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
-        """Why two entries (model, regime) may not be compared on a dataset or `overall`, from the contrasts, which
-        check every item; None if they may be compared."""
+        """Return why two entries (model, regime) may not be compared on a dataset or `overall`, from the contrasts,
+        which check every item; None if they may be compared."""
         return self._refusals.get((dataset, frozenset((left, right))))
 
     @cached_property
@@ -194,7 +194,7 @@ class Results:
         return {(row["dataset"], pair): row["refused"] for row, pair in zip(rows, sides, strict=True)}
 
     def why(self, what: str) -> str:
-        """The reason, for people, why a frame has no rows."""
+        """Return the reason, for people, why a frame has no rows."""
         return "; ".join(self.refused.get(what, [])) or (
             "this study has no such results yet" if self.is_study else "the paper prints no such table"
         )
@@ -205,13 +205,13 @@ def _of_probe_prompt(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:
-    """The datasets of the cells, in the benchmark's order."""
+    """Return the datasets of the cells, in the benchmark's order."""
     names = set(cells["dataset"])
     return [name for name in DATASETS if name in names]
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """The parts below each other; without parts, a frame without rows or columns."""
+    """Return the parts below each other; without parts, a frame without rows or columns."""
     import pandas as pd
 
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

@@ -49,7 +49,7 @@ def study_findings(results: Results) -> list[Finding]:
 
 
 def _best(rows: pd.DataFrame) -> Iterator[Finding]:
-    """The best model of each regime, and how many others the contrasts cannot tell from it."""
+    """Yield the best model of each regime, and how many others the contrasts cannot tell from it."""
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
@@ -98,7 +98,7 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
-    """Visual against textual voids, and the part of PECS that may come from shortcuts."""
+    """Yield visual against textual voids, and the part of PECS that may come from shortcuts."""
     rates = results.rates
     pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
     pooled = pooled.dropna(subset=["visual", "textual"])
@@ -150,12 +150,12 @@ def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _span(shares: pd.Series) -> str:
-    """The smallest and the largest share in percent, once if they print alike."""
+    """Return the smallest and the largest share in percent, once if they print alike."""
     low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _points(changes: pd.Series) -> str:
-    """The smallest and the largest change in points of percent, with their signs."""
+    """Return the smallest and the largest change in points of percent, with their signs."""
     low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
     return low if low == high else f"{low} to {high}"

@@ -33,7 +33,9 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def _of_panel(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows that the panel of the tables and figures decided: figures of two panels never stand side by side."""
+    """Return the rows that the panel of the tables and figures decided: figures of two panels never stand side by
+    side.
+    """
     return rows.loc[rows["panel"] == results.panel].reset_index(drop=True)
 
 
@@ -44,19 +46,19 @@ def _cells(results: StudyResults) -> pd.DataFrame:
 def _overall(results: StudyResults) -> pd.DataFrame:
     intervals = [f"{name}_ci_{end}" for name in ("acc", "abs_rec", "false_abs", "j", "pecs") for end in ("low", "high")]
     more = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
-    wanted = [name for name in (*CELL_COLUMNS, *more) if name != "dataset"]
+    columns = [name for name in (*CELL_COLUMNS, *more) if name != "dataset"]
     board = _of_panel(results, results.board)
-    rows = board.loc[board["dataset"] == "overall", wanted]
+    rows = board.loc[board["dataset"] == "overall", columns]
     return analyses.of_several_runs(rows.reset_index(drop=True))
 
 
 def _rates(results: StudyResults) -> pd.DataFrame:
     standard = results.cells.loc[results.cells["regime"] == "standard"]
-    found = []
+    result = []
     for _, rows in standard.groupby("model", sort=False):
         for part in [rows[rows["dataset"].map(taxonomy_of) == t] for t in analyses.TAXONOMIES] + [rows]:
-            found.append(_gap(results, part))
-    return joined(found).reindex(columns=pd.Index(RATE_COLUMNS)).drop_duplicates(["model", "taxonomy"])
+            result.append(_gap(results, part))
+    return joined(result).reindex(columns=pd.Index(RATE_COLUMNS)).drop_duplicates(["model", "taxonomy"])
 
 
 def _gap(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
@@ -80,13 +82,13 @@ def _scoped(results: StudyResults, scope: str) -> pd.DataFrame:
 def _sub_scenarios(results: StudyResults) -> pd.DataFrame:
     items = joined([results.tables.read_all(ITEMS, ["sub_scenario", "answer_type"], dataset=DATASETS)])
     types = items.drop_duplicates("sub_scenario").set_index("sub_scenario").loc[:, "answer_type"]
-    found = []
+    rows = []
     for _, cells in results.sub_cells.groupby("scope", sort=True):
         try:
-            found.append(analyses.sub_scenarios(cells).assign(epoch=joined_epochs(cells["epoch"])))
+            rows.append(analyses.sub_scenarios(cells).assign(epoch=joined_epochs(cells["epoch"])))
         except EpochMismatch as error:
             results.refused.setdefault("sub_scenarios", []).append(str(error))
-    table = joined(found).reindex(columns=pd.Index(SUB_COLUMNS))
+    table = joined(rows).reindex(columns=pd.Index(SUB_COLUMNS))
     return table.assign(answer_type=table.loc[:, "sub_scenario"].map(types))
 
 
@@ -102,12 +104,12 @@ def _composition(results: StudyResults) -> pd.DataFrame:
 def _cosines(results: StudyResults) -> pd.DataFrame:
     rows, mechanism = results.rows(COSINES), results.mechanism
     steered = {model: layers.steering for model, layers in mechanism.models.items()} if mechanism else {}
-    wanted = [layer == steered.get(model) for layer, model in zip(rows["layer"], rows["model"], strict=True)]
-    return rows.loc[wanted].reset_index(drop=True)
+    is_steered = [layer == steered.get(model) for layer, model in zip(rows["layer"], rows["model"], strict=True)]
+    return rows.loc[is_steered].reset_index(drop=True)
 
 
 def _effects(results: StudyResults) -> pd.DataFrame:
-    """The rows of the paper's protocol, with the dose in class gaps and the share of degenerate answers."""
+    """Return the rows of the paper's protocol, with the dose in class gaps and the share of degenerate answers."""
     every = results.rows(STEERING_EFFECTS)
     rows = in_gaps(of_paper(every), every)
     answers = rows["n"].astype(float) + rows["n_missing"].astype(float)
@@ -119,7 +121,9 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows over which means over models are taken: without reference strategies, if other models were asked."""
+    """Return the rows over which means over models are taken: without reference strategies, if other models were
+    asked.
+    """
     others = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
     return others if len(others) else rows
 
@@ -153,19 +157,21 @@ class StudyResults(Results):
         """The panel of all tables and figures that compare entries: the study's, where it decided any; else the first
         that did."""
         decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
-        found = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
+        panels = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
         own = panel_id(self._panel)
-        return own if own in found or not found else found[0]
+        return own if own in panels or not panels else panels[0]
 
     @cached_property
     def judged_by(self) -> str:
         """See `Results.judged_by`."""
         if self.board.empty:
             return ""
-        said = judged_by(_of_panel(self, self.board)).rstrip(".")
-        left = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
-        return said + (f"; {len(left)} models with figures of other panels are left out" if len(left) else "")
+        sentence = judged_by(_of_panel(self, self.board)).rstrip(".")
+        unjudged = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
+        return sentence + (
+            f"; {len(unjudged)} models with figures of other panels are left out" if len(unjudged) else ""
+        )
 
     def rows(self, table: Table) -> pd.DataFrame:
-        """All rows of a table of the study."""
+        """Return all rows of a table of the study."""
         return self.tables.read_all(table)

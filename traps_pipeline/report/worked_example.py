@@ -58,8 +58,8 @@ def worked_example(workspace: Workspace) -> Example | None:
 
 
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
-    """The control's VERDICTS row of a pair whose control was answered rightly and whose void was decided; None if there
-    is none. Seesaws come first, then models that are no reference strategy, then voids abstained on."""
+    """Return the control's VERDICTS row of a pair whose control was answered rightly and whose void was decided; None
+    if there is none. Seesaws come first, then models that are no reference strategy, then voids abstained on."""
     decided = verdicts.dropna(subset=["abstained"])
     voids = {
         (row["pair_id"], row["model"], row["run"]): bool(row["abstained"])
@@ -81,7 +81,7 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
 
 
 def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
-    """The lines beside the frames of a side: the answer, the judges' reading of it, and the verdict."""
+    """Return the lines beside the frames of a side: the answer, the judges' reading of it, and the verdict."""
     valid = [vote for vote in votes if vote["valid"]]
     on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in on_abstention)

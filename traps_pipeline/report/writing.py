@@ -68,7 +68,7 @@ Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> th
 
 
 def fraction(value: float | None, digits: int = 3) -> str:
-    """A figure as printed, with a typographic minus sign; a dash for null."""
+    """Return a figure as printed, with a typographic minus sign; a dash for null."""
     import pandas as pd
 
     if value is None or pd.isna(value):
@@ -80,7 +80,7 @@ def fraction(value: float | None, digits: int = 3) -> str:
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    """A share (0 to 1) in percent, without the sign."""
+    """Return a share (0 to 1) in percent, without the sign."""
     import pandas as pd
 
     return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
@@ -115,12 +115,13 @@ class Column:
         return self.unit != "text"
 
     def text(self, row: Mapping[str, Any]) -> str:
-        """The cell as printed; a dash where there is no number."""
+        """Return the cell as printed; a dash where there is no number."""
         figure, spread, mark = self.parts(row)
         return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
     def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
-        """The text or number of a cell, its spread and its mark, as printed; a part that the cell lacks is empty."""
+        """Return the text or number of a cell, its spread and its mark, as printed; a part that the cell lacks is
+        empty."""
         import pandas as pd
 
         value = row.get(self.field)
@@ -202,7 +203,7 @@ class PrintedTable:
 
 
 def table_files(table: PrintedTable) -> dict[str, bytes]:
-    """The table as `name.parquet`, `name.csv` (shares as fractions), `name.tex` (booktabs) and `name.md`."""
+    """Return the table as `name.parquet`, `name.csv` (shares as fractions), `name.tex` (booktabs) and `name.md`."""
     files = {
         "parquet": _parquet(table),
         "csv": csv_bytes(table.data),
@@ -213,7 +214,7 @@ def table_files(table: PrintedTable) -> dict[str, bytes]:
 
 
 def table_markdown(table: PrintedTable) -> str:
-    """Title, table, notes; texts escaped."""
+    """Return title, table, notes; texts escaped."""
     title = f"**{markdown(table.title)}.** {markdown(table.lead)}" if table.lead else f"**{markdown(table.title)}**"
     lines = [title, ""]
     if table.absence:
@@ -228,7 +229,7 @@ def table_markdown(table: PrintedTable) -> str:
 
 
 def table_text(table: PrintedTable) -> str:
-    """Title, table and notes for standard output, as `terminal.text_table` prints there."""
+    """Return title, table and notes for standard output, as `terminal.text_table` prints there."""
     lines = [wrapped(plain(f"{table.title}. {table.lead}" if table.lead else table.title)), ""]
     if table.absence:
         lines += [wrapped(plain(table.absence))]
@@ -246,7 +247,7 @@ def _without_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list
 
 
 def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Heading and cells of a column with marks: numbers are aligned to the right, and marks follow them."""
+    """Return heading and cells of a column with marks: numbers are aligned to the right, and marks follow them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
     numbers = _without_marks(replace(column, mark=""), records)
     wide, widest = max(map(len, numbers)), max(map(len, marks))
@@ -254,8 +255,8 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
 
 
 def table_latex(table: PrintedTable) -> str:
-    """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`), or for more than LONG rows a
-    `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes stand in the caption."""
+    """Return a floating `table` environment with booktabs rules (`\\usepackage{booktabs}`), or for more than LONG rows
+    a `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes stand in the caption."""
     import pandas as pd
 
     parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
@@ -275,8 +276,8 @@ def table_latex(table: PrintedTable) -> str:
 
 
 def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = None) -> str:
-    """An HTML fragment: the table in a scrolling box, notes below; escaped. With `address`, every number that has items
-    behind it is a link to them."""
+    """Return an HTML fragment: the table in a scrolling box, notes below; escaped. With `address`, every number that
+    has items behind it is a link to them."""
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
         shown = column.is_number and figure not in ("", NONE)
@@ -288,7 +289,7 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
 
 @cache
 def environment() -> jinja2.Environment:
-    """The Jinja2 environment of every page: it escapes all text, and an unknown name is an error. Templates are
+    """Return the Jinja2 environment of every page: it escapes all text, and an unknown name is an error. Templates are
     compiled once."""
     import jinja2
 
@@ -303,7 +304,7 @@ def environment() -> jinja2.Environment:
 
 
 def markdown(text: object) -> str:
-    """The text escaped so that it is neither HTML nor markup and stays in its table cell."""
+    """Return the text escaped so that it is neither HTML nor markup and stays in its table cell."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
 
 
@@ -320,17 +321,19 @@ _LATEX = str.maketrans(
 
 
 def latex(text: object) -> str:
-    """The text with all LaTeX special characters escaped; the symbols that our tables use become commands."""
+    """Return the text with all LaTeX special characters escaped; the symbols that our tables use become commands."""
     return _latex(plain(text))
 
 
 def _latex(cell: str) -> str:
-    """`latex` of a cell as it is printed, which is plain already."""
+    """Return `latex` of a cell as it is printed, which is plain already."""
     return cell.translate(_LATEX)
 
 
 def _parquet(table: PrintedTable) -> bytes:
-    """The Parquet file; text columns have type text even if all values are null, so that the schema is constant."""
+    """Return the Parquet file; text columns have type text even if all values are null, so that the schema is
+    constant.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -361,8 +364,8 @@ def figure_style() -> Iterator[None]:
 def new_figure(
     width: float, height: float, dpi: float | None = None, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """An empty figure (inches) with its own canvas; draw inside `figure_style`. layout: None keeps every element where
-    it is placed."""
+    """Return an empty figure (inches) with its own canvas; draw inside `figure_style`. layout: None keeps every element
+    where it is placed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -379,7 +382,7 @@ def freeze_layout(figure: Figure) -> None:
 
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
-    """The figure as a PDF, SVG, PNG or WebP file, without a date; the same bytes on every call."""
+    """Return the figure as a PDF, SVG, PNG or WebP file, without a date; the same bytes on every call."""
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
     with figure_style():
         if figure.get_layout_engine() is not None:
@@ -390,5 +393,5 @@ def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
 
 
 def figure_files(name: str, figure: Figure) -> dict[str, bytes]:
-    """The figure as `name.pdf`, `name.svg` and `name.png`."""
+    """Return the figure as `name.pdf`, `name.svg` and `name.png`."""
     return {f"{name}.{kind}": figure_bytes(figure, kind) for kind in FIGURE_KINDS}

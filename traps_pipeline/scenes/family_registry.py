@@ -25,14 +25,14 @@ CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES + EXTENSION_CATEGORIES, "chaotic
 
 @cache
 def family_names() -> tuple[str, ...]:
-    """Names of all families, sorted; nothing is imported."""
+    """Return names of all families, sorted; nothing is imported."""
     return tuple(sorted(module.name for module in pkgutil.iter_modules(package.__path__)))
 
 
 @cache
 def get_family(name: str) -> Family:
-    """The family of that name. Raises KeyError with the known names, TrapsError if there is none in its file, or one of
-    another name or of an unknown category."""
+    """Return the family of that name. Raises KeyError with the known names, TrapsError if there is none in its file, or
+    one of another name or of an unknown category."""
     if name not in family_names():
         raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
     module = importlib.import_module(f"{package.__name__}.{name}")
@@ -54,19 +54,19 @@ def get_family(name: str) -> Family:
 
 
 def family_digest(name: str) -> str:
-    """Hexadecimal SHA-256 of a family's file: records of one digest were drawn by the same text."""
-    found = importlib.util.find_spec(f"{package.__name__}.{name}")
-    assert found is not None and found.origin is not None, f"{_file(name)} is a file"
-    return file_digest(Path(found.origin))
+    """Return hexadecimal SHA-256 of a family's file: records of one digest were drawn by the same text."""
+    module_spec = importlib.util.find_spec(f"{package.__name__}.{name}")
+    assert module_spec is not None and module_spec.origin is not None, f"{_file(name)} is a file"
+    return file_digest(Path(module_spec.origin))
 
 
 @cache
 def families() -> tuple[Family, ...]:
-    """All families, in the order of their names. Raises TrapsError if two have one question template: an observer would
-    not know which of them is asked."""
-    found = tuple(get_family(name) for name in family_names())
+    """Return all families, in the order of their names. Raises TrapsError if two have one question template: an
+    observer would not know which of them is asked."""
+    every_family = tuple(get_family(name) for name in family_names())
     asking: dict[str, str] = {}
-    for family in found:
+    for family in every_family:
         for template in family.questions:
             other = asking.setdefault(re.sub(r"\{\w+\}", "{}", template), family.name)
             if other != family.name:
@@ -74,19 +74,19 @@ def families() -> tuple[Family, ...]:
                     f"{_file(other)} and {_file(family.name)} have one question template, {template!r}; "
                     "word it differently in the newer one"
                 )
-    return found
+    return every_family
 
 
 @cache
 def fit_to_sample(name: str) -> Family:
-    """The family of that name, if scenarios may be drawn of it. Raises TrapsError if its question is another family's
-    too, or if its hidden element is drawn depending on what is seen."""
+    """Return the family of that name, if scenarios may be drawn of it. Raises TrapsError if its question is another
+    family's too, or if its hidden element is drawn depending on what is seen."""
     families()
     family = get_family(name)
-    found = dependence(family)
-    if found is not None:
+    dependent = dependence(family)
+    if dependent is not None:
         raise TrapsError(
-            f"{_file(name)}: the hidden element is drawn depending on what is seen: {found}; "
+            f"{_file(name)}: the hidden element is drawn depending on what is seen: {dependent}; "
             "draw it from nothing but its own values, `hidden(...)`, and what is seen not from it"
         )
     return family

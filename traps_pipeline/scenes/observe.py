@@ -18,13 +18,13 @@ from traps_pipeline.video.policies import SAMPLED, FramePolicy
 
 @cache
 def family_asking(question: str) -> Family | None:
-    """The family whose templates the question fits, None if there is none."""
+    """Return the family whose templates the question fits, None if there is none."""
     return next((family for family in families() if asked(family.questions, question) is not None), None)
 
 
 def observe(clip: Path, question: str, shown: FramePolicy = SAMPLED) -> str | None:
-    """The answer that is seen in a clip, of which these frames are shown; None where the decisive thing is not to be
-    seen. What follows something from frame to frame was made for 5 frames a second."""
+    """Return the answer that is seen in a clip, of which these frames are shown; None where the decisive thing is not
+    to be seen. What follows something from frame to frame was made for 5 frames a second."""
     family = family_asking(question)
     if family is None or family.observe is None:
         return None

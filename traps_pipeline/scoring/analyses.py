@@ -42,7 +42,8 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
-    """Cells of a study from its LEADERBOARD rows, with further columns: `_std` over runs, n_pairs, n_runs and so on."""
+    """Return cells of a study from its LEADERBOARD rows, with further columns: `_std` over runs, n_pairs, n_runs and so
+    on."""
     rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
@@ -50,13 +51,13 @@ def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
 
 
 def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows, with null deviations where there was only one run."""
+    """Return the rows, with null deviations where there was only one run."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 
 
 def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
-    """Cells of the parts of datasets from METRICS rows, averaged over runs; the column `scope` names the part.
+    """Return cells of the parts of datasets from METRICS rows, averaged over runs; the column `scope` names the part.
 
     scope is `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in
     `study_cells`, with scope.
@@ -71,12 +72,13 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
 
 
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:
-    """Ids of the registry's models in a group (main, replication, ..), of a family, or with an input (video, image)."""
-    wanted = {"group": group, "family": family, "input": media}
+    """Return ids of the registry's models in a group (main, replication, ..), of a family, or with an input (video,
+    image)."""
+    criteria = {"group": group, "family": family, "input": media}
     return [
         entry.id
         for entry in load_models().values()
-        if all(value is None or getattr(entry.groups, name) == value for name, value in wanted.items())
+        if all(value is None or getattr(entry.groups, name) == value for name, value in criteria.items())
     ]
 
 
@@ -84,18 +86,19 @@ def models_of(group: str | None = None, family: str | None = None, media: str | 
 
 
 def overall(cells: pd.DataFrame) -> pd.DataFrame:
-    """Equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs; PECS is averaged too.
+    """Return equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs; PECS is averaged
+    too.
 
     A (model, regime) that lacks one of the datasets in `cells` has no row, so that all rows average the same datasets.
     """
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
-    whole = cells.loc[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
-    return _means(whole.groupby(["model", "regime"], sort=False), SHARES).reset_index()
+    complete_runs = cells.loc[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
+    return _means(complete_runs.groupby(["model", "regime"], sort=False), SHARES).reset_index()
 
 
 def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFrame:
-    """AbsRec under guided over AbsRec under standard, each averaged over datasets: columns model, ratio.
+    """Return AbsRec under guided over AbsRec under standard, each averaged over datasets: columns model, ratio.
 
     There is one row per model that has both regimes. means: a study's own `overall` rows, which leave out runs without
     all datasets; by default the means of `cells`. The ratio is infinite where standard is 0 and guided is not, and null
@@ -113,7 +116,7 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
-    """Quartiles of the standard deviations over runs, over all cells: one row with q25, median, q75, n.
+    """Return quartiles of the standard deviations over runs, over all cells: one row with q25, median, q75, n.
 
     Cells with a single run have no deviation and are left out. The paper does not say which metric its quartiles
     describe; the default is PECS.
@@ -129,7 +132,8 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """The models on the frontier in (Acc, J) after averaging over datasets: `frontier` of `overall`, with the column j.
+    """Return the models on the frontier in (Acc, J) after averaging over datasets: `frontier` of `overall`, with the
+    column j.
 
     It orders models and makes no ratio or gap, so epochs may differ.
     """
@@ -138,7 +142,7 @@ def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
-    """The rows that no other row of the same regime dominates in acc and j, by falling Acc.
+    """Return the rows that no other row of the same regime dominates in acc and j, by falling Acc.
 
     A model dominates another if it is at least as good in both figures and better in one. Two equal models are both on
     the frontier; a model without Acc or J is not on it.
@@ -147,12 +151,12 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
 
     means = means.dropna(subset=["acc", "j"])
     best = [group.loc[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
-    found = pd.DataFrame(pd.concat(best or [means]))
-    return found.sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
+    points = pd.DataFrame(pd.concat(best or [means]))
+    return points.sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
 
 
 def _dominated(points: pd.DataFrame) -> np.ndarray:
-    """Which rows are dominated by another row in (acc, j): (rows,) bool."""
+    """Return which rows are dominated by another row in (acc, j): (rows,) bool."""
     at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
     no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
     better = (at[None] > at[:, None]).any(-1)
@@ -160,7 +164,7 @@ def _dominated(points: pd.DataFrame) -> np.ndarray:
 
 
 def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
-    """The cells whose Acc x AbsRec exceeds PECS by more than `threshold`, with columns naive and gap added."""
+    """Return the cells whose Acc x AbsRec exceeds PECS by more than `threshold`, with columns naive and gap added."""
     cells = _checked(cells)
     cells["naive"] = cells["acc"] * cells["abs_rec"]
     cells["gap"] = cells["naive"] - cells["pecs"]
@@ -168,13 +172,14 @@ def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
 
 
 def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
-    """The cells with PECS 0: no more abstention on voids than on controls in any run, or no correct answer."""
+    """Return the cells with PECS 0: no more abstention on voids than on controls in any run, or no correct answer."""
     cells = _checked(cells)
     return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
 
 def degenerate_strategies() -> pd.DataFrame:
-    """Expected figures of strategies that do not discriminate: strategy, acc, false_abs, abs_rec, j, pecs, naive.
+    """Return expected figures of strategies that do not discriminate: strategy, acc, false_abs, abs_rec, j, pecs,
+    naive.
 
     acc is null where the strategy does not determine it; PECS is still 0, since J is not above 0.
     """
@@ -200,7 +205,8 @@ def degenerate_strategies() -> pd.DataFrame:
 
 
 def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMIES) -> pd.DataFrame:
-    """Textual over visual AbsRec: columns model, regime, taxonomy (occlusion, chaotic, pooled), visual, textual, gap.
+    """Return textual over visual AbsRec: columns model, regime, taxonomy (occlusion, chaotic, pooled), visual, textual,
+    gap.
 
     Visual is the AbsRec on the taxonomy's own dataset, textual that on its ill-posed one. `pooled` is the mean of the
     two textual values over the mean of the two visual ones, if both taxonomies are in `cells`. The gap is infinite
@@ -232,7 +238,7 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
 
 
 def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
-    """The thinking member of each pair minus the other: columns thinking, other, regime, dataset, acc, abs_rec,
+    """Return the thinking member of each pair minus the other: columns thinking, other, regime, dataset, acc, abs_rec,
     false_abs, pecs (differences of fractions). The cells may be of the dataset `overall` too."""
     import pandas as pd
 
@@ -255,7 +261,8 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
-    """Means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics, "sub_scenario")`.
+    """Return means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics,
+    "sub_scenario")`.
 
     Columns: dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec, pecs under standard, over n_models models; these
     with the prefix guided_, over guided_n_models; abs_rec_uplift and false_abs_uplift (guided minus standard), over the
@@ -290,8 +297,8 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_rec", "guided_abs_rec")) -> pd.DataFrame:
-    """Unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`; n_pairs and
-    n_missing are sums, where table has them.
+    """Return unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`;
+    n_pairs and n_missing are sums, where table has them.
 
     table has one row per occlusion sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
     """
@@ -302,8 +309,8 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
 
 
 def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
-    """Mean Acc under standard by the control's answer, over the models that have an Acc, from `scoped_cells(metrics,
-    "label")`.
+    """Return mean Acc under standard by the control's answer, over the models that have an Acc, from
+    `scoped_cells(metrics, "label")`.
 
     Columns dataset, sub_scenario, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
     """
@@ -329,7 +336,7 @@ def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataF
 
 
 def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
-    """Means of columns of a pandas groupby, null where any value is."""
+    """Return means of columns of a pandas groupby, null where any value is."""
     import pandas as pd
 
     values = groups[list(columns)]
@@ -338,7 +345,7 @@ def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
-    """A copy of the cells. Raises ValueError where a column is missing or a cell has two rows."""
+    """Return a copy of the cells. Raises ValueError where a column is missing or a cell has two rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")

@@ -43,7 +43,7 @@ class Finding:
 
 
 def audit() -> pd.DataFrame:
-    """Every finding: columns group, statement, published, recomputed, verdict, reason, line."""
+    """Return every finding: columns group, statement, published, recomputed, verdict, reason, line."""
     groups: Sequence[Callable[[], Iterator[Finding]]] = (
         claims,
         overall_means,
@@ -61,7 +61,8 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """The findings for a terminal: every claim, every difference, and counts of the rest; with `everything`, all."""
+    """Return the findings for a terminal: every claim, every difference, and counts of the rest; with `everything`,
+    all."""
     lines = []
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
@@ -77,7 +78,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def counts_text(findings: pd.DataFrame) -> str:
-    """How many statements agree, differ with a declaration, and disagree, as a sentence."""
+    """Return how many statements agree, differ with a declaration, and disagree, as a sentence."""
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
     agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
@@ -90,20 +91,20 @@ def counts_text(findings: pd.DataFrame) -> str:
 
 
 def claims() -> Iterator[Finding]:
-    """Every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
+    """Yield every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
     for claim in published("claims").to_dict("records"):
-        printed, found = str(claim["published"]), CLAIMS[str(claim["id"])]()
-        same = _same_words(printed, found.words) if found.agrees is None else found.agrees
+        printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
+        same = _same_words(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
         verdict: Verdict = AGREES if same else DIFFERS
-        reason = found.reason if verdict == DIFFERS else ""
-        if verdict == DIFFERS and found.agrees is None:
-            reason = f"{_differences(printed, found.words)}{'; ' + reason if reason else ''}"
+        reason = recomputed.reason if verdict == DIFFERS else ""
+        if verdict == DIFFERS and recomputed.agrees is None:
+            reason = f"{_differences(printed, recomputed.words)}{'; ' + reason if reason else ''}"
         statement, line = f"{claim['id']}: {claim['statement']}", str(claim["line"])
-        yield Finding("claims", statement, printed, _shown(found.words), verdict, reason, line)
+        yield Finding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
-    """Whether the numbers agree at the printed digits and both name the same things."""
+    """Return whether the numbers agree at the printed digits and both name the same things."""
     ours, theirs = _numbers(recomputed), _numbers(printed)
     if len(ours) != len(theirs):
         return False
@@ -112,7 +113,7 @@ def _same_words(printed: str, recomputed: str) -> bool:
 
 
 def _names(words: str) -> set[str]:
-    """The whole names in a text, so that a model's id is not found at the beginning of a longer id."""
+    """Return the whole names in a text, so that a model's id is not found at the beginning of a longer id."""
     return set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", words))) - {"to", "and", "of"}
 
 
@@ -121,7 +122,7 @@ def _numbers(words: str) -> list[str]:
 
 
 def _half_unit(number: str) -> float:
-    """Half of the last printed digit of a number."""
+    """Return half of the last printed digit of a number."""
     return 0.5 * 10.0 ** -len(number.partition(".")[2])
 
 
@@ -133,12 +134,12 @@ def _differences(printed: str, recomputed: str) -> str:
 
 
 def _shown(words: str) -> str:
-    """The words with trailing zeros of four-decimal numbers removed."""
+    """Return the words with trailing zeros of four-decimal numbers removed."""
     return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
 
 
 def _line(table: str) -> str:
-    """The line of a table in the paper's source."""
+    """Return the line of a table in the paper's source."""
     (place,) = published_rows("tables", name=table)
     return str(place["line"])
 
@@ -147,7 +148,7 @@ def _line(table: str) -> str:
 
 
 def overall_means() -> Iterator[Finding]:
-    """The overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
+    """Yield the overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
     cells = published_cells()
     ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
     of_entry = dict(iter(cells.groupby(["model", "regime"])))
@@ -172,7 +173,8 @@ _REPLICATION = models_of(group="replication")
 
 
 def pecs_factors() -> Iterator[Finding]:
-    """PECS of every cell against its printed factors, within the range that averaging over runs and rounding allow.
+    """Yield PECS of every cell against its printed factors, within the range that averaging over runs and rounding
+    allow.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
     deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
@@ -208,7 +210,7 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
 
 
 def gaps() -> Iterator[Finding]:
-    """The printed gaps against the printed rates, each of which may have been rounded in its last digit."""
+    """Yield the printed gaps against the printed rates, each of which may have been rounded in its last digit."""
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
@@ -230,7 +232,7 @@ def gaps() -> Iterator[Finding]:
 
 
 def probe_means() -> Iterator[Finding]:
-    """The printed four-path means against the means of the printed pairs, each rounded in its last digit."""
+    """Yield the printed four-path means against the means of the printed pairs, each rounded in its last digit."""
     columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
     for row in published_rows("probe_means"):
         pairs = published_rows("probe_transfer", model=row["model"], transfer_type=row["transfer_type"])
@@ -244,7 +246,7 @@ def probe_means() -> Iterator[Finding]:
 
 
 def transfer_types() -> Iterator[Finding]:
-    """Printed transfer types against the definitions."""
+    """Yield printed transfer types against the definitions."""
     for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
             ours, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
@@ -257,8 +259,8 @@ def transfer_types() -> Iterator[Finding]:
 
 
 def steering_means() -> Iterator[Finding]:
-    """The regime table of gemma-4-e4b against the means of its dose table, which the paper calls a verification run
-    with a smaller budget whose rates lie below. (Of qwen3-vl-8b the claims make the same comparison.)"""
+    """Yield the regime table of gemma-4-e4b against the means of its dose table, which the paper calls a verification
+    run with a smaller budget whose rates lie below. (Of qwen3-vl-8b the claims make the same comparison.)"""
     prompts = {"direction_family": "all", "direction_regime": "standard", "inference_regime": "guided"}
     (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
     for side in ("control", "void"):
@@ -276,7 +278,7 @@ def steering_means() -> Iterator[Finding]:
 
 
 def steering_families() -> Iterator[Finding]:
-    """The regime table's figures over all paths against the means of its two source families, of four paths each.
+    """Yield the regime table's figures over all paths against the means of its two source families, of four paths each.
 
     The table does not say under which prompt the families' directions were read; the guided ones are assumed.
     """
@@ -296,7 +298,8 @@ def steering_families() -> Iterator[Finding]:
 
 
 def validation_scores() -> Iterator[Finding]:
-    """F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last digit."""
+    """Yield F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last
+    digit."""
     for row in published("judge_validation").to_dict("records"):
         precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
         ours = _f1(precision, recall)
@@ -314,7 +317,7 @@ def _f1(precision: float, recall: float) -> float:
 
 
 def composition_sums() -> Iterator[Finding]:
-    """Category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
+    """Yield category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
     counts: dict[str, int] = {}
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
@@ -329,7 +332,7 @@ def composition_sums() -> Iterator[Finding]:
 
 
 def contradictions() -> Iterator[Finding]:
-    """Statements of the paper's text that another of its places contradicts, which no arithmetic decides."""
+    """Yield statements of the paper's text that another of its places contradicts, which no arithmetic decides."""
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
         yield Finding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

@@ -121,17 +121,18 @@ def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
-    """The central interval over the last axis without NaN: (.., resamples) -> (.., 2); NaN where all values are NaN."""
+    """Return the central interval over the last axis without NaN: (.., resamples) -> (.., 2); NaN where all values are
+    NaN."""
     return np.stack([quantile(draws, q) for q in ((1 - level) / 2, (1 + level) / 2)], axis=-1)
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
-    """A quantile over the last axis without NaN: (.., resamples) -> (..); NaN where all values are NaN."""
+    """Return a quantile over the last axis without NaN: (.., resamples) -> (..); NaN where all values are NaN."""
     flat = draws.reshape(-1, draws.shape[-1])
-    whole = ~np.isnan(flat).any(axis=1)
+    is_complete = ~np.isnan(flat).any(axis=1)
     values = np.full(len(flat), np.nan)
-    values[whole] = np.quantile(flat[whole], q, axis=1)
-    for row in np.flatnonzero(~whole):
+    values[is_complete] = np.quantile(flat[is_complete], q, axis=1)
+    for row in np.flatnonzero(~is_complete):
         valid = flat[row][~np.isnan(flat[row])]
         if len(valid):
             values[row] = np.quantile(valid, q)
@@ -139,7 +140,8 @@ def quantile(draws: np.ndarray, q: float) -> np.ndarray:
 
 
 def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> np.ndarray:
-    """How often each scenario is drawn in each resample: (resamples, scenarios) float32, rows sum to `scenarios`."""
+    """Return how often each scenario is drawn in each resample: (resamples, scenarios) float32, rows sum to
+    `scenarios`."""
     if not scenarios:
         return np.zeros((resamples, 0), np.float32)
     rng = np.random.default_rng(seed)
@@ -178,14 +180,14 @@ def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Weighted sums of counts of every cell and resample: (cells, kinds, resamples).
+    """Return weighted sums of counts of every cell and resample: (cells, kinds, resamples).
 
     weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of whole
     counts stay below 2^16, so float32 products are exact; weighted counts are summed in float64.
     """
     scenarios, cells, kinds = counts.shape
-    whole = np.array_equal(counts, np.rint(counts))
-    products = counts.astype(np.float32 if whole else np.float64).reshape(scenarios, cells * kinds).T @ weights.T
+    are_integers = np.array_equal(counts, np.rint(counts))
+    products = counts.astype(np.float32 if are_integers else np.float64).reshape(scenarios, cells * kinds).T @ weights.T
     return products.reshape(cells, kinds, len(weights)).astype(np.float64)
 
 
@@ -207,19 +209,21 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
     in_mean: whether the shares enter a mean over datasets or arms, where the unseen scenarios weigh less (_IN_MEAN).
     """
     decisions = sums.shape[-2] // 3
-    yes, made = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
+    yes, decided = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
     unseen = sums[..., 2 * decisions :, :] * (_IN_MEAN if in_mean else 1.0)
     with np.errstate(invalid="ignore"):
-        return np.stack([yes, yes + unseen]) / (made + unseen)
+        return np.stack([yes, yes + unseen]) / (decided + unseen)
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples), as `shares_of`."""
+    """Return RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples), as
+    `shares_of`.
+    """
     return figures_of_shares(shares_of(sums, in_mean))
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """RESAMPLED figures of the ends of Acc, FalseAbs and AbsRec: (2, .., 3, resamples) -> (2, .., RESAMPLED,
+    """Return RESAMPLED figures of the ends of Acc, FalseAbs and AbsRec: (2, .., 3, resamples) -> (2, .., RESAMPLED,
     resamples)."""
     acc, false_abs, abs_rec = np.moveaxis(shares, -2, 0)
     j = abs_rec - false_abs[::-1]
@@ -236,8 +240,8 @@ def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, drawn: Drawn, named: str) -> dict[tuple[str, int], np.ndarray]:
-    """(dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples), for the items of one model and
-    regime. A dataset (an arm) may have items of both taxonomies. named: what tells the items' unseen scenarios from
+    """Return (dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples), for the items of one model
+    and regime. A dataset (an arm) may have items of both taxonomies. named: what tells the items' unseen scenarios from
     others'."""
     totals: dict[tuple[str, int], np.ndarray] = {}
     having: dict[tuple[str, int], np.ndarray] = {}
@@ -259,14 +263,17 @@ def run_sums(group: pd.DataFrame, drawn: Drawn, named: str) -> dict[tuple[str, i
 def means_over_runs(
     sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
-    """Dataset or `overall` -> mean over runs (2, RESAMPLED, draws), from the `run_sums` of (dataset, run) and the
-    function (`figures_of`) that makes figures of them."""
+    """Return dataset or `overall` -> mean over runs (2, RESAMPLED, draws), from the `run_sums` of (dataset, run) and
+    the function (`figures_of`) that makes figures of them."""
     runs = sorted({run for _, run in sums})
     means = {
         dataset: np.mean([figures(sums[dataset, run], False) for run in runs if (dataset, run) in sums], axis=0)
         for dataset in DATASETS
         if any((dataset, run) in sums for run in runs)
     }
-    whole = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
+    complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
     nothing = np.full((2, len(RESAMPLED), draws), np.nan)
-    return {**means, "overall": np.mean([figures(own, True) for own in whole], axis=0) if whole else nothing}
+    return {
+        **means,
+        "overall": np.mean([figures(own, True) for own in complete_runs], axis=0) if complete_runs else nothing,
+    }

@@ -148,16 +148,16 @@ def _family_gaps() -> Recomputed:
 
 
 def _by_regime(figure: str, models: Sequence[str]) -> dict[tuple[str, str], dict[str, float]]:
-    """The printed figure by (model, dataset) and regime."""
-    found: dict[tuple[str, str], dict[str, float]] = {}
+    """Return the printed figure by (model, dataset) and regime."""
+    shares: dict[tuple[str, str], dict[str, float]] = {}
     for row in published_rows("behavioral_per_dataset"):
         if row["model"] in models:
-            found.setdefault((row["model"], row["dataset"]), {})[row["regime"]] = row[figure]
-    return found
+            shares.setdefault((row["model"], row["dataset"]), {})[row["regime"]] = row[figure]
+    return shares
 
 
 def _means(cells: dict[tuple[str, str], dict[str, float]]) -> dict[str, dict[str, float]]:
-    """The equal-weight means over datasets by model and regime."""
+    """Return the equal-weight means over datasets by model and regime."""
     models = dict.fromkeys(model for model, _ in cells)
     of = {model: [cell for (name, _), cell in cells.items() if name == model] for model in models}
     return {model: {r: fmean(cell[r] for cell in parts) for r in PAPER_REGIMES} for model, parts in of.items()}

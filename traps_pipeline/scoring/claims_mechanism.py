@@ -29,7 +29,7 @@ class Recomputed:
 
 
 def text_figure(name: str) -> float:
-    """A figure that stands in the paper's text alone, by its id in `other.csv`."""
+    """Return a figure that stands in the paper's text alone, by its id in `other.csv`."""
     (row,) = published_rows("other", id=name)
     return float(row["value"])
 

@@ -43,8 +43,8 @@ _Side = tuple[str, str]  # model, regime
 
 
 def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
-    """CONTRASTS rows from the bootstrap, the METRICS rows that it resamples (for their figures) and the VERDICTS rows
-    from which both are made (for their items and epochs).
+    """Return CONTRASTS rows from the bootstrap, the METRICS rows that it resamples (for their figures) and the VERDICTS
+    rows from which both are made (for their items and epochs).
 
     The rows compare every pair of models under each regime and every pair of regimes of each model, in PECS and in J,
     on each dataset, and overall where both sides have a run of all four.
@@ -71,7 +71,8 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
 
 
 def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """The change between two studies, such as two versions of the benchmark: now minus then, on their common pairs.
+    """Return the change between two studies, such as two versions of the benchmark: now minus then, on their common
+    pairs.
 
     then and now are VERDICTS rows; a pair that is not whole in both, in the same run and cell, is left out. Columns:
     model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now, difference, ci_low,
@@ -85,7 +86,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
     board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
     asked, drawn = [answered(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
-    draws = [dict(zip(found.entries, found.values, strict=True)) for found in drawn]
+    draws = [dict(zip(resampled.entries, resampled.values, strict=True)) for resampled in drawn]
     sizes = _scenarios(sides[1])
     rows = []
     for entry, about in board.to_dict("index").items():
@@ -96,7 +97,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
             row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
             row["n_scenarios"] = sizes[entry]
             if refused is None:
-                ends = [found[entry][:, RESAMPLED.index(figure)] for found in draws[::-1]]
+                ends = [resampled[entry][:, RESAMPLED.index(figure)] for resampled in draws[::-1]]
                 row |= _difference(figure, ends, [row["now"], row["then"]], sizes[entry])
             rows.append(row | {"refused": refused})
     columns = [
@@ -121,23 +122,25 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
 
 
 def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
-    """The rows of each study on the pairs (by model, regime and run) that have control and void in both studies."""
+    """Return the rows of each study on the pairs (by model, regime and run) that have control and void in both
+    studies.
+    """
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
     pairs = common.groupby(key).size()
-    whole = pairs.loc[pairs == 2].reset_index().loc[:, key]
-    return [rows.merge(whole, on=key) for rows in (then, now)]
+    complete_pairs = pairs.loc[pairs == 2].reset_index().loc[:, key]
+    return [rows.merge(complete_pairs, on=key) for rows in (then, now)]
 
 
 def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """`leaderboard.standings` of verdicts, indexed by ENTRY."""
+    """Return `leaderboard.standings` of verdicts, indexed by ENTRY."""
     cells = [cell_metrics(part, {}) for _, part in verdicts.groupby("dataset")]
     board = standings(pd.concat(cells, ignore_index=True)).set_index(ENTRY)
     return board.loc[:, ["n_pairs", *FIGURES, *VERSION_SIDES]]
 
 
 def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """REGIME_TESTS rows: McNemar's exact test for every model, dataset, run, decision and pair of regimes."""
+    """Return REGIME_TESTS rows: McNemar's exact test for every model, dataset, run, decision and pair of regimes."""
     rows = []
     for decision, side, column in (
         ("void_abstention", "void", "abstained"),
@@ -188,7 +191,7 @@ def mcnemar_p(only_left: int, only_right: int) -> float:
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Holm's step-down correction of (n,) p-values; a NaN is not counted and stays NaN."""
+    """Return Holm's step-down correction of (n,) p-values; a NaN is not counted and stays NaN."""
     corrected = np.full(len(p), np.nan)
     valid = np.flatnonzero(~np.isnan(p))
     order = valid[np.argsort(p[valid], kind="stable")]
@@ -216,7 +219,7 @@ def least_p(scenarios: int) -> float:
 
 
 def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
-    """The number of scenarios of every (model, regime, dataset), and of `overall`: those of all its datasets."""
+    """Return the number of scenarios of every (model, regime, dataset), and of `overall`: those of all its datasets."""
     rows = verdicts[[*ENTRY, "scenario_id"]]
     counts = pd.concat([rows, rows.assign(dataset="overall")]).groupby(ENTRY)["scenario_id"].nunique()
     return cast(dict[tuple[str, str, str], int], counts.to_dict())
@@ -225,7 +228,7 @@ def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
 def _difference(
     figure: str, sides: Sequence[np.ndarray], observed: Sequence[float], scenarios: int
 ) -> dict[str, float]:
-    """The columns of a paired difference of two sides over a number of scenarios: its interval and two-sided p.
+    """Return the columns of a paired difference of two sides over a number of scenarios: its interval and two-sided p.
 
     sides: the resampled ends of the left and the right, (2, resamples) each. If every resample is NaN, there is no p.
     """
@@ -242,7 +245,7 @@ def _difference(
 
 
 def _beyond(ends: np.ndarray) -> float:
-    """The share of ends at 0 or below, one added to their count.
+    """Return the share of ends at 0 or below, one added to their count.
 
     This is never below 1 / (resamples + 1), so no contrast of many models could be significant after Holm's correction.
     Therefore, where no end lies there, it is the tail of a normal distribution with the mean and standard error of the
@@ -257,8 +260,8 @@ def _beyond(ends: np.ndarray) -> float:
 
 
 def _separable(table: pd.DataFrame, family: Sequence[str]) -> pd.Series:
-    """Whether p_holm is below SEPARABLE_BELOW; null where no answers of so few scenarios could make the smallest p of
-    the family that small, and False where there is no p."""
+    """Return whether p_holm is below SEPARABLE_BELOW; null where no answers of so few scenarios could make the smallest
+    p of the family that small, and False where there is no p."""
     compared = table.groupby(list(family))["p"].transform("count").to_numpy(float)
     least = np.array([least_p(int(n)) if n == n else 0.0 for n in table["n_scenarios"].astype(float)])
     separable = pd.Series(table["p_holm"].astype(float) < SEPARABLE_BELOW, dtype="boolean")

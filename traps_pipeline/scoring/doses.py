@@ -120,8 +120,8 @@ DATASETS_READ = tuple(dict.fromkeys(name for one in HYPOTHESES for dose in one.d
 def hypotheses(
     verdicts: pd.DataFrame, offered: Mapping[str, int], resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """HYPOTHESES rows from the VERDICTS rows of DATASETS_READ: one for each model, regime, hypothesis and dose of which
-    a dose besides the reference was asked.
+    """Return HYPOTHESES rows from the VERDICTS rows of DATASETS_READ: one for each model, regime, hypothesis and dose
+    of which a dose besides the reference was asked.
 
     offered: how many answers each item's question has, by item id. Figures are computed per run, then averaged; their
     intervals are of resampled scenarios, in which a scenario keeps all its doses.
@@ -133,17 +133,17 @@ def hypotheses(
     rows: list[dict[str, Any]] = []
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
         for hypothesis in HYPOTHESES:
-            found = [(dose, _items_of(group, dose)) for dose in hypothesis.doses]
-            there = [(dose, its) for dose, its in found if len(its)]
-            if {dose for dose, _ in there} - {hypothesis.doses[0], *_in_pairs(hypothesis)}:
-                reference = found[0][1]
-                made = [_row(hypothesis, dose, its, reference, drawn) for dose, its in there]
-                rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in made]
+            by_dose = [(dose, _items_of(group, dose)) for dose in hypothesis.doses]
+            with_items = [(dose, its) for dose, its in by_dose if len(its)]
+            if {dose for dose, _ in with_items} - {hypothesis.doses[0], *_in_pairs(hypothesis)}:
+                reference = by_dose[0][1]
+                dose_rows = [_row(hypothesis, dose, its, reference, drawn) for dose, its in with_items]
+                rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in dose_rows]
     return _beside_rules(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
 
 
 def _in_pairs(hypothesis: Hypothesis) -> set[Dose]:
-    """Doses that are sides of the pairs, which any study has."""
+    """Return doses that are sides of the pairs, which any study has."""
     return {dose for dose in hypothesis.doses if set(dose.datasets) <= set(VISUAL)}
 
 
@@ -155,7 +155,7 @@ def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
 def _row(
     hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, drawn: Drawn
 ) -> dict[str, Any]:
-    """The columns of a dose's row, those of rules aside."""
+    """Return the columns of a dose's row, those of rules aside."""
     model, regime = (items[name].iloc[0] for name in ("model", "regime"))
     named = f"{model}|{regime}|{hypothesis.name}"
     figures = _figures(items, drawn, f"{named}|{dose.name}")
@@ -200,8 +200,8 @@ def _row(
 
 
 def _figures(items: pd.DataFrame, drawn: Drawn, named: str) -> np.ndarray:
-    """The ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws): of all items per run,
-    then the mean over runs."""
+    """Return the ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws): of all items per
+    run, then the mean over runs."""
     sums = run_sums(items.assign(dataset="all"), drawn, named)
     by_run = []
     for of_run in sums.values():
@@ -220,7 +220,7 @@ def _ends(name: str) -> list[str]:
 
 
 def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
-    """Why a dose is not compared with its reference: other campaigns (docs/spec.md 9.2), panels or runs."""
+    """Return why a dose is not compared with its reference: other campaigns (docs/spec.md 9.2), panels or runs."""
     for what, column in (("epoch", "epoch"), ("panel", "panel")):
         own, other = (joined_epochs(some[column]) for some in (dose, reference))
         if own != other or "+" in own:
@@ -230,28 +230,29 @@ def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
 
 
 def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with what the rules get of the same hypothesis and dose: the highest value, and the largest change, each
-    with the rule that has it. A rule does not read the regime, so one of another regime serves where there is none."""
+    """Return the rows with what the rules get of the same hypothesis and dose: the highest value, and the largest
+    change, each with the rule that has it. A rule does not read the regime, so one of another regime serves where there
+    is none."""
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
-    told = []
+    remarks = []
     for row in rows.to_dict("records"):
         same = [one for one in of_rules if all(one[name] == row[name] for name in ("hypothesis", "dose"))]
         own = {one["model"]: one for one in sorted(same, key=lambda one: one["regime"] == row["regime"])}
-        told.append({**_best(own.values(), "value", "rule"), **_best(own.values(), "change", "rule_changing")})
-    return rows.assign(**{name: [one[name] for one in told] for name in told[0]}) if told else rows
+        remarks.append({**_best(own.values(), "value", "rule"), **_best(own.values(), "change", "rule_changing")})
+    return rows.assign(**{name: [one[name] for one in remarks] for name in remarks[0]}) if remarks else rows
 
 
 def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str, Any]:
-    """The rule whose value is highest, or whose change is largest, either way."""
+    """Return the rule whose value is highest, or whose change is largest, either way."""
     known = [row for row in rows if row[field] is not None and row[field] == row[field]]
     best = max(known, key=lambda row: abs(row[field]) if field == "change" else row[field], default=None)
     return {named: best and best["model"], f"rule_{field}": best and best[field]}
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """How many rows break their definition: a share outside [0, 1], an interval out of order, a J that is not AbsRec
-    less FalseAbs, a change that is not the value less the reference's although all scenarios are compared. Null is not
-    wrong."""
+    """Return how many rows break their definition: a share outside [0, 1], an interval out of order, a J that is not
+    AbsRec less FalseAbs, a change that is not the value less the reference's although all scenarios are compared. Null
+    is not wrong."""
     wrong = np.zeros(len(table), bool)
     for name in (*SHOWN, "change"):
         figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
@@ -259,7 +260,7 @@ def wrong_rows(table: pd.DataFrame) -> int:
         wrong |= (figure < least) | (figure > most) | (low > high) | (low < least) | (high > most)
     columns = ("j", "abs_rec", "false_abs", "change", "value", "at_reference")
     j, abs_rec, false_abs, change, value, before = (table[name].to_numpy(float) for name in columns)
-    whole = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)
+    are_complete = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)
     wrong |= np.abs(j - (abs_rec - false_abs)) > 1e-12
-    wrong |= whole & (np.abs(change - (value - before)) > 1e-12)
+    wrong |= are_complete & (np.abs(change - (value - before)) > 1e-12)
     return int(wrong.sum())

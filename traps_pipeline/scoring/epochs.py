@@ -28,7 +28,7 @@ class EpochMismatch(TrapsError):
 
 
 def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
-    """Raises EpochMismatch if any row of `epochs` holds two different epochs.
+    """Raise EpochMismatch if any row of `epochs` holds two different epochs.
 
     epochs has one row per comparison (its index names it, e.g. model and dataset) and one column per side; a null side
     is not compared. `what` names the figure in the message.
@@ -47,25 +47,25 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
 
 
 def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """The items that every (model, regime, dataset) answered over its runs, with their origin; `overall` has the runs
-    with all four datasets, and is left out if there is none."""
-    whole = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
+    """Return the items that every (model, regime, dataset) answered over its runs, with their origin; `overall` has the
+    runs with all four datasets, and is left out if there is none."""
+    is_complete = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
     columns = ["model", "regime", "dataset", "item_id", "epoch", "panel"]
-    found: dict[tuple[str, str, str], dict[str, Origin]] = {}
+    origins: dict[tuple[str, str, str], dict[str, Origin]] = {}
     for *cell, item, epoch, panel, in_overall in (
-        verdicts[columns].assign(whole=whole).drop_duplicates().itertuples(index=False, name=None)
+        verdicts[columns].assign(whole=is_complete).drop_duplicates().itertuples(index=False, name=None)
     ):
         model, regime, dataset = cell
         for scope in (dataset, "overall") if in_overall else (dataset,):
-            items = found.setdefault((model, regime, scope), {})
+            items = origins.setdefault((model, regime, scope), {})
             old = items.get(item, Origin("", ""))
             items[item] = Origin(joined_epochs([old.epoch, epoch]), joined_epochs([old.panel, panel]))
-    return dict(found)
+    return dict(origins)
 
 
 def refusal(left: Answered, right: Answered) -> str | None:
-    """Why two sides may not be compared item by item: their items differ, or an item's campaigns or panels do, or
-    panels are mixed; else None."""
+    """Return why two sides may not be compared item by item: their items differ, or an item's campaigns or panels do,
+    or panels are mixed; else None."""
     panels = [sorted({origin.panel for origin in side.values()}) for side in (left, right)]
     if left == right and all(len(names) < 2 and "+" not in "".join(names) for names in panels):
         return None
@@ -81,6 +81,6 @@ def refusal(left: Answered, right: Answered) -> str | None:
 
 
 def _named(items: list[str]) -> str:
-    """Names the first of these items with its dataset, and counts the others."""
+    """Return names the first of these items with its dataset, and counts the others."""
     dataset, more = items[0].partition(":")[0], len(items) - 1
     return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")

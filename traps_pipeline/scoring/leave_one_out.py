@@ -19,7 +19,8 @@ _COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 def leave_one_out(
     verdicts: pd.DataFrame, votes: pd.DataFrame, board: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made from them.
+    """Return LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made from
+    them.
 
     PECS by the two other judges is computed as PECS by the panel: per run, then averaged; overall over the four
     datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted. There are
@@ -41,8 +42,8 @@ def leave_one_out(
 def two_judge_verdicts(
     verdicts: pd.DataFrame, votes: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Each judge, and the VERDICTS rows that the two others give without it. They decide an item where both votes are
-    valid and agree; 1-1 is undecided. An item without an answer has no decision."""
+    """Yield each judge, and the VERDICTS rows that the two others give without it. They decide an item where both votes
+    are valid and agree; 1-1 is undecided. An item without an answer has no decision."""
     cast = ratings(votes, judges)
     if len(cast.judges) < 2:
         return
@@ -54,6 +55,6 @@ def two_judge_verdicts(
 
 
 def _scored(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """The standings of verdicts."""
+    """Return the standings of verdicts."""
     cells = [cell_metrics(rows, {}) for _, rows in verdicts.groupby("dataset", sort=True)]
     return standings(pd.concat(cells, ignore_index=True))

@@ -34,7 +34,7 @@ SCOPED_BY: Mapping[str, tuple[str, ...]] = {
 
 
 def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """COUNTS of every verdict, 0 or 1 each, on the verdicts' index: (items, 6) int64.
+    """Return COUNTS of every verdict, 0 or 1 each, on the verdicts' index: (items, 6) int64.
 
     A null decision counts in no denominator: shares are over decided items.
     """
@@ -55,12 +55,12 @@ def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """PECS = Acc x max(0, J), elementwise; NaN where either is."""
+    """Return PECS = Acc x max(0, J), elementwise; NaN where either is."""
     return acc * np.maximum(j, 0.0)
 
 
 def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]] = SCOPED_BY) -> pd.DataFrame:
-    """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
+    """Return METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
 
     There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
     in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
@@ -86,22 +86,23 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def mean(values: pd.Series) -> float:
-    """The mean; null where any value is null, so that no mean silently uses fewer values."""
+    """Return the mean; null where any value is null, so that no mean silently uses fewer values."""
     return float(np.mean(values.to_numpy(float)))
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
-    """The distinct campaigns or panels, sorted and joined by `+`; an input may itself be such a list."""
+    """Return the distinct campaigns or panels, sorted and joined by `+`; an input may itself be such a list."""
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
 def joined_versions(versions: Iterable[str]) -> str:
-    """The distinct versions of the benchmark, sorted and joined; an input may itself be such a list."""
+    """Return the distinct versions of the benchmark, sorted and joined; an input may itself be such a list."""
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
 def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
-    """Every verdict with its counts, once for each scope that it belongs to: ((1 + len(scoped_by)) x items) rows."""
+    """Return every verdict with its counts, once for each scope that it belongs to: ((1 + len(scoped_by)) x items)
+    rows."""
     import pandas as pd
 
     counts = decision_counts(verdicts)
@@ -122,7 +123,7 @@ def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) ->
 
 
 def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """FIGURES of every cell, (cells,) each."""
+    """Return FIGURES of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
     j = abs_rec - false_abs
     return {
@@ -136,16 +137,17 @@ def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """BOUNDS of every cell, (cells,) each: PECS of all pairs with every missing decision at its worst, and at its best.
+    """Return BOUNDS of every cell, (cells,) each: PECS of all pairs with every missing decision at its worst, and at
+    its best.
 
     Each decision is bounded separately, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
     FalseAbs, so that these two are its exact extremes. Where nothing is missing both equal PECS bit for bit.
     """
     pairs = sums["n_pairs"].to_numpy(float)
-    taken = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
-    lacking = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in taken}
-    least = {name: taken[name] / pairs for name in taken}
-    most = {name: (taken[name] + lacking[name]) / pairs for name in taken}
+    decided = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
+    lacking = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in decided}
+    least = {name: decided[name] / pairs for name in decided}
+    most = {name: (decided[name] + lacking[name]) / pairs for name in decided}
     return {
         "pecs_low": pecs_of(least["correct"], least["abs_rec"] - most["false_abs"]),
         "pecs_high": pecs_of(most["correct"], most["abs_rec"] - least["false_abs"]),
@@ -153,7 +155,9 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray]:
-    """Wilson's score interval of each share yes / of, (n,) each; 95 % by default. NaN where nothing was decided."""
+    """Return Wilson's score interval of each share yes / of, (n,) each; 95 % by default. NaN where nothing was
+    decided.
+    """
     of = np.where(of > 0, of, np.nan)
     share, square = yes / of, z**2 / of
     centre = (share + square / 2) / (1 + square)
@@ -162,7 +166,7 @@ def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tup
 
 
 def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """The denominator of each share, and the share's interval: (cells,) each."""
+    """Return the denominator of each share, and the share's interval: (cells,) each."""
     columns = {}
     for figure, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
         of = sums[f"{name}_of"].to_numpy("int64")
@@ -172,14 +176,14 @@ def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
-    """Numerator over denominator, (cells,); NaN where the denominator is 0."""
+    """Return numerator over denominator, (cells,); NaN where the denominator is 0."""
     of = sums[f"{name}_of"].to_numpy(float)
     return sums[name].to_numpy(float) / np.where(of > 0, of, np.nan)
 
 
 def wrong_figures(cells: pd.DataFrame) -> int:
-    """How many figures of METRICS rows break their definition: a share or bound outside [0, 1], a PECS that is not
-    Acc x max(0, J) or lies outside its bounds. Null figures (nothing decided) are not wrong."""
+    """Return how many figures of METRICS rows break their definition: a share or bound outside [0, 1], a PECS that is
+    not Acc x max(0, J) or lies outside its bounds. Null figures (nothing decided) are not wrong."""
     acc, abs_rec, false_abs, pecs = (cells[name].to_numpy(float) for name in ("acc", "abs_rec", "false_abs", "pecs"))
     low, high = (cells[name].to_numpy(float) for name in BOUNDS)
     outside = sum(int(((share < 0) | (share > 1)).sum()) for share in (acc, abs_rec, false_abs, low, high))

@@ -61,8 +61,8 @@ def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: in
     observed, ends = studies = _studies(counts, shares, SEED)
     low, high = interval(ends, observed, limits_of("pecs")).T
     scenarios = sum(max(pairs.get(name, 0) for name in DATASETS if taxonomy_of(name) == t) for t in TAXONOMIES)
-    found = {m: _detectable(counts, shares, studies, scenarios, m) for m in {1, max(1, comb(models, 2))}}
-    return Precision(float(np.mean(high - low)), found[1], found[max(found)])
+    detectable = {m: _detectable(counts, shares, studies, scenarios, m) for m in {1, max(1, comb(models, 2))}}
+    return Precision(float(np.mean(high - low)), detectable[1], detectable[max(detectable)])
 
 
 def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +80,7 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
 
 
 def _better(shares: Shares, by: float) -> Shares:
-    """A model whose PECS is higher by so much: it abstains on more voids, then answers more controls rightly."""
+    """Return a model whose PECS is higher by so much: it abstains on more voids, then answers more controls rightly."""
     goal = shares.pecs + by
     abs_rec = min(1.0, shares.false_abs + goal / shares.acc) if shares.acc else 1.0
     j = abs_rec - shares.false_abs
@@ -92,22 +92,22 @@ def _better(shares: Shares, by: float) -> Shares:
 def _detectable(
     counts: Sequence[int], shares: Shares, studies: tuple[np.ndarray, np.ndarray], scenarios: int, comparisons: int
 ) -> float | None:
-    """The difference of a better model from this one that is found in 80 % of studies at 5 % by the number of
+    """Return the difference of a better model from this one that is found in 80 % of studies at 5 % by the number of
     comparisons: the lower end of the difference is then above 0."""
     if least_p(scenarios) * comparisons >= SEPARABLE_BELOW:
         return None
-    found, (observed, ends) = 0.0, studies
+    smallest, (observed, ends) = 0.0, studies
     for seed in range(SEED + 1, SEED + 1 + ROUNDS):
-        better, better_ends = _studies(counts, _better(shares, found), seed)
+        better, better_ends = _studies(counts, _better(shares, smallest), seed)
         apart, low = better - observed, better_ends[:, 0] - ends[:, 1]
         below = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
-        found = float(apart.mean() - low.mean() + below + NormalDist().inv_cdf(POWER) * apart.std())
-    return found if found <= 1 else None
+        smallest = float(apart.mean() - low.mean() + below + NormalDist().inv_cdf(POWER) * apart.std())
+    return smallest if smallest <= 1 else None
 
 
 def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
-    """The ends of PECS, (studies, 2, draws), of weighted numbers of pairs (studies, 6, draws): right, abstained, wrong
-    on the control, each with a void that was abstained on and with one that was not."""
+    """Return the ends of PECS, (studies, 2, draws), of weighted numbers of pairs (studies, 6, draws): right, abstained,
+    wrong on the control, each with a void that was abstained on and with one that was not."""
     all_pairs = answers.sum(axis=1)
     yes = answers[:, :2].sum(axis=1), answers[:, 2:4].sum(axis=1), answers[:, ::2].sum(axis=1)
     sums = np.stack([part for own in yes for part in (own, all_pairs)], axis=1)

@@ -23,7 +23,7 @@ SHARES: Mapping[str, tuple[str, ...]] = {
 
 
 def prevalence(labels: pd.DataFrame) -> pd.DataFrame:
-    """CONFABULATION_PREVALENCE rows from CONFABULATION rows: shares of validly labelled failures, with Wilson
+    """Return CONFABULATION_PREVALENCE rows from CONFABULATION rows: shares of validly labelled failures, with Wilson
     intervals; null where a model has none. A model without a sampled failure has no row, since it was not run."""
     rows = [_row(str(model), group) for model, group in labels.groupby("model", sort=True)]
     return pd.DataFrame(rows, columns=pd.Index(CONFABULATION_PREVALENCE.names))

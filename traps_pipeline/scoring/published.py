@@ -17,7 +17,8 @@ _RENAMED = {"acc": "acc_pct", "abs_rec": "abs_rec_pct", "false_abs": "false_abs_
 
 
 def published(name: str) -> pd.DataFrame:
-    """One published file as numbers: percentages are percent, PECS and AUROC fractions (`assets/published/README.md`).
+    """Return one published file as numbers: percentages are percent, PECS and AUROC fractions
+    (`assets/published/README.md`).
 
     name is the file's stem, e.g. `probe_transfer`. Raises TrapsError that lists the files for another name.
     """
@@ -25,7 +26,7 @@ def published(name: str) -> pd.DataFrame:
 
 
 def as_printed(name: str) -> pd.DataFrame:
-    """One published file as texts, with the digits that the paper prints; an empty cell is an empty text.
+    """Return one published file as texts, with the digits that the paper prints; an empty cell is an empty text.
 
     Raises TrapsError that lists the files for another name.
     """
@@ -33,18 +34,19 @@ def as_printed(name: str) -> pd.DataFrame:
 
 
 def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
-    """The rows of one published file as numbers and texts; where: values that the wanted rows have in these columns."""
+    """Return the rows of one published file as numbers and texts; where: values that the wanted rows have in these
+    columns."""
     return [dict(row) for row in _records(name) if all(row[column] == value for column, value in where.items())]
 
 
 def published_digest() -> str:
-    """Digest of `assets/published`, from which the paper's tables and figures are made."""
+    """Return digest of `assets/published`, from which the paper's tables and figures are made."""
     files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
     return digest(files)[:16]
 
 
 def published_cells() -> pd.DataFrame:
-    """The per-dataset table as cells for `analyses`: one row per (model, dataset, regime), shares as fractions.
+    """Return the per-dataset table as cells for `analyses`: one row per (model, dataset, regime), shares as fractions.
 
     Columns model, dataset, regime, epoch, n_pairs, acc, abs_rec, false_abs, pecs, and their `_std` over runs (null for
     the single greedy run of qwen3-vl-8b). A cell has one epoch: `corrected`; on chaotic_ill_posed it is `original`, or
@@ -59,7 +61,7 @@ def published_cells() -> pd.DataFrame:
 
 
 def published_overall() -> pd.DataFrame:
-    """The overall leaderboard as printed, shares as fractions: model, regime, acc, abs_rec, false_abs, pecs."""
+    """Return the overall leaderboard as printed, shares as fractions: model, regime, acc, abs_rec, false_abs, pecs."""
     rows = published("overall")
     shares = {share: rows[printed] / 100 for share, printed in _RENAMED.items()}
     return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])

@@ -48,8 +48,8 @@ _ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", 
 
 
 def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """ROBUST rows from the VERDICTS rows of pairs and arms: one row per model and regime that has a run with all four
-    datasets and an arm.
+    """Return ROBUST rows from the VERDICTS rows of pairs and arms: one row per model and regime that has a run with all
+    four datasets and an arm.
 
     Figures are computed per run, then averaged; a figure that is null in one run is null. If runs have different arms,
     the entry uses the runs with the most arms, all with the same ones (`arms`).
@@ -74,8 +74,8 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
 
 
 def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
-    """The runs of a model and regime that its entry uses, and the arms that each of them has: the largest set of arms.
-    Among sets of the same size it is the one that most runs have, then the first in the order of ARMS."""
+    """Return the runs of a model and regime that its entry uses, and the arms that each of them has: the largest set of
+    arms. Among sets of the same size it is the one that most runs have, then the first in the order of ARMS."""
     sets: dict[tuple[str, ...], list[int]] = {}
     for run, rows in group.groupby("run", sort=True):
         datasets = {*rows["dataset"]}
@@ -89,7 +89,7 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
 
 
 def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
-    """The columns of an entry's ROBUST row except model, regime and arms."""
+    """Return the columns of an entry's ROBUST row except model, regime and arms."""
     runs = dict(list(items.groupby("run", sort=True)))
     sums = run_sums(items, drawn, named)
     kinds = (*DATASETS, *(arm for arm in arms if arm in ROBUST_ARMS))
@@ -176,15 +176,15 @@ def _conjunction(items: pd.DataFrame, drawn: Drawn, named: str) -> tuple[np.ndar
 
 
 def _missing(items: pd.DataFrame) -> int:
-    """The number of items, over runs, that lack a decision of their side."""
+    """Return the number of items, over runs, that lack a decision of their side."""
     control = items["side"] == "control"
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     return int(len(items) - decided.sum())
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Why no figure joins pairs and arms: they were answered in different campaigns (docs/spec.md 9.2), or judged by
-    different panels."""
+    """Return why no figure joins pairs and arms: they were answered in different campaigns (docs/spec.md 9.2), or
+    judged by different panels."""
     of_arms = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
         return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
@@ -195,7 +195,7 @@ def _refusal(items: pd.DataFrame) -> str | None:
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """How many ROBUST rows break their definition: a figure outside [0, 1] or outside its interval. Null is not
+    """Return how many ROBUST rows break their definition: a figure outside [0, 1] or outside its interval. Null is not
     wrong."""
     shares = table[[*WITH_INTERVAL, "inference_acc", "inference_abstains"]].to_numpy(float)
     wrong = ((shares < 0) | (shares > 1)).any(axis=1)

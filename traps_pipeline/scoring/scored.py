@@ -21,7 +21,7 @@ class Scored:
 
 
 def score(verdicts: pd.DataFrame) -> Scored:
-    """The figures of VERDICTS rows of the pairs, of any models, regimes and runs."""
+    """Return the figures of VERDICTS rows of the pairs, of any models, regimes and runs."""
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
     resampled = resample(verdicts)
     paired = contrasts(resampled, cells, verdicts)

@@ -29,13 +29,15 @@ _SUMMED = ["n_missing", "n_items", *COUNTED]
 
 
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """LEADERBOARD rows: `standings` with their `bootstrap.intervals` and the ranks that CONTRASTS rows leave open."""
+    """Return LEADERBOARD rows: `standings` with their `bootstrap.intervals` and the ranks that CONTRASTS rows leave
+    open."""
     board = standings(metrics).merge(intervals, on=ENTRY, how="left", validate="one_to_one")
     return board.join(_ranks(board, contrasts)).loc[:, LEADERBOARD.names]
 
 
 def standings(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are ignored).
+    """Return every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are
+    ignored).
 
     Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
     datasets within each run first; a run that lacks a dataset is left out of it, and a model and regime without a
@@ -61,20 +63,20 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
+    """Return FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
     return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean))
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """One row per (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
+    """Return one row per (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
     cells = metrics.loc[metrics["scope"] == "all"]
     cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_by_family(metrics), on=CELL, how="left")
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 
 def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
-    """CELL and `pecs_by_family`: PECS of Acc, AbsRec and FalseAbs with families weighted equally. A family is what the
-    paper calls a sub-scenario."""
+    """Return CELL and `pecs_by_family`: PECS of Acc, AbsRec and FalseAbs with families weighted equally. A family is
+    what the paper calls a sub-scenario."""
     families = metrics.loc[metrics["scope"].str.startswith("sub_scenario:")].groupby(CELL)
     shares = families[["acc", "abs_rec", "false_abs"]].agg(mean)
     pecs = pecs_of(shares["acc"].to_numpy(float), (shares["abs_rec"] - shares["false_abs"]).to_numpy(float))
@@ -82,20 +84,20 @@ def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
-    """One row per (model, regime, run) that has all four datasets, in the columns of METRICS."""
+    """Return one row per (model, regime, run) that has all four datasets, in the columns of METRICS."""
     groups = cells.groupby(_RUN, sort=True)
-    whole = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
-    counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
-    counts[REJECTS] = whole[REJECTS].sum(min_count=1)
-    overall = whole[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
-    overall["epoch"] = whole["epoch"].agg(joined_epochs)
-    overall["panel"] = whole["panel"].agg(joined_epochs)
-    overall["benchmark_version"] = whole["benchmark_version"].agg(joined_versions)
+    complete_runs = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
+    counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
+    counts[REJECTS] = complete_runs[REJECTS].sum(min_count=1)
+    overall = complete_runs[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
+    overall["epoch"] = complete_runs["epoch"].agg(joined_epochs)
+    overall["panel"] = complete_runs["panel"].agg(joined_epochs)
+    overall["benchmark_version"] = complete_runs["benchmark_version"].agg(joined_versions)
     return overall.reset_index().assign(dataset="overall")
 
 
 def _anywhere(wrong: pd.Series) -> pd.Series:
-    """What is wrong with entries, on the index ENTRY; with `overall` also where it is wrong with any dataset."""
+    """Return what is wrong with entries, on the index ENTRY; with `overall` also where it is wrong with any dataset."""
     anywhere = cast(pd.Series, wrong.groupby(level=["model", "regime"]).transform("any")).astype(bool)
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
@@ -126,7 +128,9 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
-    """How many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]); null is not wrong."""
+    """Return how many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]); null is not
+    wrong.
+    """
     wrong = 0
     for figure in RESAMPLED:
         low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))

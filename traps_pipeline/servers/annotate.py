@@ -66,11 +66,11 @@ class Annotation:
         self.store = LabelStore(workspace.labels)
 
     def _sample(self, task: TaskName) -> pd.DataFrame:
-        found = sample(self.workspace, task)
+        units_drawn = sample(self.workspace, task)
         if task == "answerability":  # a clip that was not copied with the study cannot be shown
-            there = [self.workspace.resolve(self.items[item]["clip"]).is_file() for item in found["item_id"]]
-            found = found.loc[there]
-        return found.set_index("unit", drop=False)
+            has_clip = [self.workspace.resolve(self.items[item]["clip"]).is_file() for item in units_drawn["item_id"]]
+            units_drawn = units_drawn.loc[has_clip]
+        return units_drawn.set_index("unit", drop=False)
 
     @cached_property
     def items(self) -> dict[str, dict[str, Any]]:
@@ -90,31 +90,31 @@ class Annotation:
         return {row["sample_id"]: row for row in sheet_rows(self.workspace)}
 
     def progress(self, who: str, task: TaskName) -> tuple[int, int]:
-        """How many units a person has labelled, and how many there are for them."""
+        """Return how many units a person has labelled, and how many there are for them."""
         own = self.samples[task]
         return sum(unit in own.index for unit in self.store.labelled(who, task)), len(own)
 
     def next_unit(self, who: str, task: TaskName) -> str | None:
-        """The unit that a person labels next, which they are now shown: the one that waits, else the first of their
-        queue. None where all are labelled, or those left are of scenarios that they met in this sitting."""
+        """Return the unit that a person labels next, which they are now shown: the one that waits, else the first of
+        their queue. None where all are labelled, or those left are of scenarios that they met in this sitting."""
         own, seen = self.samples[task], self.store.shown(who)
         waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
         met = {each.scenario_id for each in seen if each.at > since}  # in any task: answers tell about clips
         done = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
-        left = (
+        open_units = (
             unit
             for unit in queue_of(who, own)
             if unit not in done and (blind or own.loc[unit, "scenario_id"] not in met)
         )
-        unit = waiting[-1] if waiting else next(left, None)
+        unit = waiting[-1] if waiting else next(open_units, None)
         if unit is not None:
             self.store.show(who, task, unit, str(own.loc[unit, "scenario_id"]))
         return unit
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
-        """The task and unit of a handle that this person was given. Raises NotThere."""
+        """Return the task and unit of a handle that this person was given. Raises NotThere."""
         for each in self.store.shown(who):
             task = require_task(each.task)
             if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
@@ -142,14 +142,14 @@ class Annotation:
         self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
-        """The clip behind a handle. Raises NotThere."""
+        """Return the clip behind a handle. Raises NotThere."""
         task, unit = self.find(who, handle)
         if task != "answerability":
             raise NotThere("nothing of this name is shown to you")
         return study_file(self.workspace, self.items[str(self.samples[task].loc[unit, "item_id"])]["clip"])
 
     def shown(self, who: str, task: TaskName, unit: str) -> dict[str, Any]:
-        """All that a browser gets of a unit."""
+        """Return all that a browser gets of a unit."""
         row = self.samples[task].loc[unit]
         handle = self.store.handle(who, task, unit)
         if task == "confabulation":
@@ -158,22 +158,22 @@ class Annotation:
             texts |= {"why": failure["why_unanswerable"], "trace": failure["reasoning_trace"]}
             return {"task": task, "handle": handle, **texts}
         item = self.items[str(row["item_id"])]
-        told = {"task": task, "handle": handle, "question": item["question"]}
+        fields = {"task": task, "handle": handle, "question": item["question"]}
         if task == "answerability":
-            return told | {"fps": self.fps.get(item["clip"])}
+            return fields | {"fps": self.fps.get(item["clip"])}
         cell = Cell(row["dataset"], Evaluation(row["model"], row["regime"], int(row["run"])))
         answers = self.workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text"]).set_index("item_id")
         truth = {"truth": item["ground_truth"]} if task == "correctness" else {}
-        return told | truth | {"answer": str(answers.loc[row["item_id"], "text"])}
+        return fields | truth | {"answer": str(answers.loc[row["item_id"], "text"])}
 
     # --- pages --------------------------------------------------------------------------------------------------------
 
     def start_page(self, who: str) -> str:
-        """The page on which a person chooses a task."""
+        """Return the page on which a person chooses a task."""
         return page("annotate_start.html.j2", who=who, tasks=self._tasks(who))
 
     def unit_page(self, who: str, task: TaskName) -> str:
-        """The page of the next unit, or the one that says why there is none now."""
+        """Return the page of the next unit, or the one that says why there is none now."""
         unit = self.next_unit(who, task)
         done, total = self.progress(who, task)
         about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": done}
@@ -183,12 +183,12 @@ class Annotation:
         return page("annotate.html.j2", **about, total=total, shown=self.shown(who, task, unit))
 
     def _tasks(self, who: str) -> dict[TaskName, tuple[str, int, int]]:
-        """Title, labelled and all units of each task."""
+        """Return title, labelled and all units of each task."""
         return {task: (title, *self.progress(who, task)) for task, title in TITLES.items()}
 
 
 def annotation_app(annotation: Annotation) -> FastAPI:
-    """The app of the labelling pages; the guard before it says who asks."""
+    """Return the app of the labelling pages; the guard before it says who asks."""
     app = new_app()
 
     def who(request: Request) -> str:

@@ -37,7 +37,7 @@ class Touched:
     question: str = ""
 
     def plus(self, other: Touched) -> Touched:
-        """Both together."""
+        """Return both together."""
         known = self.dollars is not None and other.dollars is not None
         return Touched(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
@@ -46,7 +46,7 @@ class Touched:
         )  # fmt: skip
 
     def sentence(self) -> str:
-        """The counts in words."""
+        """Return the counts in words."""
         money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
         calls = f"at most {self.answers} answers and {self.votes} votes"
         asked = f"{len(self.items)} items are asked or judged again: {calls}, {money}"
@@ -54,8 +54,8 @@ class Touched:
 
 
 def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
-    """What a correction of a scenario touches, against its SCENE_SPECS row. Raises TrapsError where the family refuses
-    the parameters."""
+    """Return what a correction of a scenario touches, against its SCENE_SPECS row. Raises TrapsError where the family
+    refuses the parameters."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:
@@ -89,7 +89,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 
 def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
-    """Model, dataset of the taxonomy, and how many evaluations the study's experiments ask of it."""
+    """Yield model, dataset of the taxonomy, and how many evaluations the study's experiments ask of it."""
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)

@@ -25,7 +25,9 @@ class Neighbour:
 
 
 def fingerprint(clip: Path) -> np.ndarray:
-    """The difference hash of a clip's first, middle and last frame: (3 * SIDE * SIDE,) bool. Raises DamagedClip."""
+    """Return the difference hash of a clip's first, middle and last frame: (3 * SIDE * SIDE,) bool. Raises
+    DamagedClip.
+    """
     import cv2
 
     frames, _ = decode(clip)
@@ -39,7 +41,7 @@ def fingerprint(clip: Path) -> np.ndarray:
 
 def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
     """For each scenario that has others of its family, the nearest of them."""
-    found = {}
+    nearest_of = {}
     for family in sorted(set(families.values())):
         names = sorted(name for name in prints if families[name] == family)
         if len(names) < 2:
@@ -49,8 +51,8 @@ def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) ->
             distances = (table != table[k]).mean(axis=1)
             distances[k] = np.inf
             nearest = int(np.argmin(distances))
-            found[name] = Neighbour(names[nearest], float(distances[nearest]))
-    return found
+            nearest_of[name] = Neighbour(names[nearest], float(distances[nearest]))
+    return nearest_of
 
 
 class Comparison:

@@ -90,12 +90,13 @@ class LabelStore:
             ) from error
 
     def handle(self, who: str, task: str, unit: str) -> str:
-        """The name under which one person's browser knows a unit: it reveals nothing, and is another's for others."""
-        whole = "\0".join((who, task, unit)).encode()
-        return hmac.new(self._secret.encode(), whole, "sha256").hexdigest()[:HANDLE_DIGITS]
+        """Return the name under which one person's browser knows a unit: it reveals nothing, and is another's for
+        others."""
+        content = "\0".join((who, task, unit)).encode()
+        return hmac.new(self._secret.encode(), content, "sha256").hexdigest()[:HANDLE_DIGITS]
 
     def shown(self, who: str) -> list[Shown]:
-        """What a person was shown, in all tasks, the latest last."""
+        """Return what a person was shown, in all tasks, the latest last."""
         with self._database() as database:
             rows = database.execute(
                 "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
@@ -111,7 +112,7 @@ class LabelStore:
             )
 
     def labelled(self, who: str, task: str) -> list[str]:
-        """The units that a person has labelled, the latest last."""
+        """Return the units that a person has labelled, the latest last."""
         with self._database() as database:
             rows = database.execute(
                 "SELECT unit FROM labels WHERE who = ? AND task = ? GROUP BY unit ORDER BY max(seq)", (who, task)
@@ -150,8 +151,10 @@ class LabelStore:
             with self._database() as database:
                 names = "seq, task, unit, who, at, seconds, label"
                 rows = database.execute(f"SELECT {names} FROM labels WHERE seq > ? ORDER BY seq", (last,)).fetchall()
-            found = [dict(zip(names.split(", "), row, strict=True)) for row in rows]
-            append_whole(descriptor, b"".join(checked_line(row | {"label": json.loads(row["label"])}) for row in found))
+            records = [dict(zip(names.split(", "), row, strict=True)) for row in rows]
+            append_whole(
+                descriptor, b"".join(checked_line(row | {"label": json.loads(row["label"])}) for row in records)
+            )
             os.fsync(descriptor)
             if is_new:
                 sync_folder(self.folder)
@@ -177,14 +180,14 @@ class LabelStore:
 
 
 def _last_seq(descriptor: int) -> int:
-    """The number of the last label in the file, 0 in an empty one; half a line that a crash left is cut off."""
+    """Return the number of the last label in the file, 0 in an empty one; half a line that a crash left is cut off."""
     size = os.lseek(descriptor, 0, os.SEEK_END)
     from_ = max(0, size - _TAIL)
     tail = os.pread(descriptor, _TAIL, from_)
-    whole = tail.rfind(b"\n") + 1
-    if whole != len(tail):
-        os.ftruncate(descriptor, from_ + whole)
-    line = tail[:whole].rstrip(b"\n").rpartition(b"\n")[2]
+    end = tail.rfind(b"\n") + 1
+    if end != len(tail):
+        os.ftruncate(descriptor, from_ + end)
+    line = tail[:end].rstrip(b"\n").rpartition(b"\n")[2]
     try:
         return int(json.loads(line)["seq"]) if line else 0
     except (ValueError, KeyError, TypeError) as error:

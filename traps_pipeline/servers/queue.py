@@ -40,14 +40,14 @@ def queue(
     found: pd.DataFrame,
     alike: Mapping[str, float],
 ) -> list[str]:
-    """The scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. found: `flags`;
-    alike: by scenario, how far the one that looks most alike is."""
+    """Return the scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. found:
+    `flags`; alike: by scenario, how far the one that looks most alike is."""
     if name == "all":
         return list(scenarios)
-    left = [each for each in scenarios if each not in reviewed]
+    waiting = [each for each in scenarios if each not in reviewed]
     if name == "unreviewed":
-        return left
+        return waiting
     if name == "alike":
-        return sorted((each for each in left if each in alike), key=lambda each: (alike[each], each))
+        return sorted((each for each in waiting if each in alike), key=lambda each: (alike[each], each))
     scores = found[name].to_dict() if len(found) else {}
-    return sorted((each for each in left if scores.get(each, 0) > 0), key=lambda each: (-scores[each], each))
+    return sorted((each for each in waiting if scores.get(each, 0) > 0), key=lambda each: (-scores[each], each))

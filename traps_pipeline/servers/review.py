@@ -93,10 +93,10 @@ class Review:
     @cached_property
     def comparison(self) -> Comparison:
         """Which control clips look alike; it begins when the queue of these is opened."""
-        there = {
+        differences = {
             id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
         }
-        clips = {id_: path for id_, path in sorted(there.items()) if path.is_file()}
+        clips = {id_: path for id_, path in sorted(differences.items()) if path.is_file()}
         return Comparison(clips, {id_: str(spec["family"]) for id_, spec in self.specs.items()})
 
     @cached_property
@@ -108,13 +108,13 @@ class Review:
         return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
-        """The row of a scenario. Raises NotThere."""
+        """Return the row of a scenario. Raises NotThere."""
         if scenario_id not in self.specs:
             raise NotThere(f"{scenario_id}: not a scenario of this study")
         return self.specs[scenario_id]
 
     def reviewed(self) -> frozenset[str]:
-        """The scenarios about which a decision stands."""
+        """Return the scenarios about which a decision stands."""
         last = {each.scenario_id: each for _, each in read_corrections()}
         return frozenset(id_ for id_, each in last.items() if is_reviewed([each]))
 
@@ -137,9 +137,9 @@ class Review:
             raise Conflict(str(error)) from error
 
     def _free_id(self, family: str) -> str:
-        """The first id from 9001 on that no scenario of the benchmark has or had."""
-        taken = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
-        return next(name for k in count(9001) if (name := f"{family}-{k}") not in taken)
+        """Return the first id from 9001 on that no scenario of the benchmark has or had."""
+        used = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
+        return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
 
     def undo(self, sent: Undo) -> None:
         """Take back the last decision. Raises NotThere, Refused and Conflict."""
@@ -150,11 +150,11 @@ class Review:
             raise Conflict(str(error)) from error
 
     def preview(self, sent: Preview) -> dict[str, Any]:
-        """The words after the changes, and what asking again would take. Raises NotThere and Refused."""
+        """Return the words after the changes, and what asking again would take. Raises NotThere and Refused."""
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
-        found = touched(self.workspace, spec, correction)
-        return {"question": found.question, "cost": found.sentence()}
+        cost = touched(self.workspace, spec, correction)
+        return {"question": cost.question, "cost": cost.sentence()}
 
     def _correction(self, scenario_id: str, action: str, changes: Mapping[str, Any], why: str) -> Correction:
         allowed = {*WORDS, "answer", "params"}
@@ -167,7 +167,7 @@ class Review:
             raise Refused(f"{scenario_id}: {explain(error)}") from error
 
     def summary(self) -> Touched:
-        """What the decisions touch that the study's tables do not have yet."""
+        """Return what the decisions touch that the study's tables do not have yet."""
         scenarios = load_scenarios(self.workspace.study)
         total = Touched(added=sorted({*scenarios} - {*self.specs}))
         for scenario_id, spec in self.specs.items():
@@ -183,13 +183,13 @@ class Review:
     # --- pages --------------------------------------------------------------------------------------------------------
 
     def scenario_page(self, scenario_id: str, name: QueueName) -> str:
-        """The page of one scenario."""
+        """Return the page of one scenario."""
         spec, waiting = self.spec(scenario_id), self.queue(name)
         decisions = decisions_on(scenario_id)
         place = waiting.index(scenario_id) if scenario_id in waiting else -1
         alike = self.comparison.found.get(scenario_id)
         items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
-        shown = {
+        fields = {
             "scenario_id": scenario_id,
             "seen": len(decisions),
             "queue": name,
@@ -209,7 +209,7 @@ class Review:
         }
         return page(
             "review.html.j2",
-            shown=shown,
+            shown=fields,
             queue=name,
             spec=spec,
             labels=", ".join(spec["labels"]),
@@ -226,7 +226,7 @@ class Review:
         )
 
     def done_page(self, name: QueueName) -> str:
-        """The page at the end of a queue: what the decisions touch, and the commands that follow them."""
+        """Return the page at the end of a queue: what the decisions touch, and the commands that follow them."""
         return page(
             "review_done.html.j2",
             touched=self.summary(),
@@ -240,13 +240,16 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """What shows and then asks what decisions touch. An experiment that is not among ours has a file of its own."""
+        """Return what shows and then asks what decisions touch. An experiment that is not among ours has a file of its
+        own."""
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
-        there = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
-        return [f"traps status {there}", f"traps run {there}"]
+        target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
+        return [f"traps status {target}", f"traps run {target}"]
 
     def strip(self, scenario_id: str) -> bytes:
-        """The contact strip: frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
+        """Return the contact strip: frames of the control above the void's at the same times, as JPEG. Raises
+        NotThere.
+        """
         import cv2
 
         from traps_pipeline.video.encode import decode
@@ -265,7 +268,7 @@ class Review:
         return jpeg.tobytes()
 
     def clip(self, scenario_id: str, side: str) -> Path:
-        """The file of a clip. Raises NotThere where the study has none."""
+        """Return the file of a clip. Raises NotThere where the study has none."""
         row = self.clips.get((scenario_id, side))
         if row is None:
             raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
@@ -277,7 +280,7 @@ def _as_json(value: Any) -> Any:
 
 
 def review_app(review: Review) -> FastAPI:
-    """The app of a review; it stands behind the guard."""
+    """Return the app of a review; it stands behind the guard."""
     app = new_app()
 
     @app.get("/")

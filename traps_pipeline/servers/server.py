@@ -42,7 +42,7 @@ class Conflict(TrapsError):
 
 
 def new_app() -> FastAPI:
-    """An app without documentation pages, in which a TrapsError becomes a sentence and a status."""
+    """Return an app without documentation pages, in which a TrapsError becomes a sentence and a status."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.exception_handler(TrapsError)
@@ -60,7 +60,7 @@ def new_app() -> FastAPI:
 
 @cache
 def templates() -> jinja2.Environment:
-    """The templates of the pages; all text is escaped, and an unknown name is an error."""
+    """Return the templates of the pages; all text is escaped, and an unknown name is an error."""
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(WEB),
         autoescape=True,
@@ -72,7 +72,7 @@ def templates() -> jinja2.Environment:
 
 
 def page(template: str, **values: Any) -> str:
-    """A page with the explorer's look. Its policy lets it load its own scripts, clips and pictures alone."""
+    """Return a page with the explorer's look. Its policy lets it load its own scripts, clips and pictures alone."""
     style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return templates().get_template(template).render(style=style, style_digest=digest, **values)
@@ -87,7 +87,7 @@ def script(*names: str) -> str:
 
 
 def study_file(workspace: Workspace, relative: str) -> Path:
-    """A clip that a table of the study names. Raises NotThere where it is not among the study's clips."""
+    """Return a clip that a table of the study names. Raises NotThere where it is not among the study's clips."""
     path = workspace.resolve(relative)
     inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
     if not inside or not path.is_file():
@@ -110,7 +110,7 @@ class Listening:
     behind: str = ""
 
     def addresses(self) -> dict[str, str]:
-        """The address to open, by the person it is for ("" where there is one for all)."""
+        """Return the address to open, by the person it is for ("" where there is one for all)."""
         shown = f"[{self.host}]" if ":" in self.host else self.host
         base = self.behind.rstrip("/") or f"http://{shown}:{self.port}"
         tokens = {self.tokens: ""} if isinstance(self.tokens, str) else self.tokens

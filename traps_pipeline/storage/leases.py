@@ -25,9 +25,9 @@ def alone(store: Store, name: str) -> Iterator[None]:
 
 
 def leased(store: Store, work: str, items: int, size: int) -> Generator[range]:
-    """Ranges of items, at most `size` each: first those that no other process has, then the others as they are given
-    back, finished or not. The lease of a range ends when the next one is asked for. Raises TrapsError where no lease
-    can be had."""
+    """Yield ranges of items, at most `size` each: first those that no other process has, then the others as they are
+    given back, finished or not. The lease of a range ends when the next one is asked for. Raises TrapsError where no
+    lease can be had."""
     held = list[tuple[str, range]]()
     for first in range(0, items, size):
         name, chunk = f"{work}/{first:07d}", range(first, min(first + size, items))

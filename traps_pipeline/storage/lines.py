@@ -18,7 +18,7 @@ NOT_WHOLE = "not what was written"
 
 
 def checked_line(row: Mapping[str, Any]) -> bytes:
-    """A row (not empty) as a line, its checksum in it as the last field. Raises ValueError for NaN."""
+    """Return a row (not empty) as a line, its checksum in it as the last field. Raises ValueError for NaN."""
     body = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()[:-1]
     return body + _SUM + _sum_of(body) + b'"}\n'
 
@@ -28,7 +28,7 @@ def _sum_of(body: bytes) -> bytes:
 
 
 def is_whole(line: bytes) -> bool:
-    """Whether a line is what `checked_line` made."""
+    """Return whether a line is what `checked_line` made."""
     tail = line[-_TAIL:]
     return tail.startswith(_SUM) and tail.endswith(b'"}\n') and tail[len(_SUM) : -3] == _sum_of(line[:-_TAIL])
 
@@ -44,7 +44,7 @@ class Line:
 
 
 def read_checked(path: Path) -> Iterator[Line]:
-    """The lines of a file that `append_whole` and `checked_line` wrote, damaged ones too."""
+    """Yield the lines of a file that `append_whole` and `checked_line` wrote, damaged ones too."""
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):  # the last one; that which lacks only its end, or has another one, is whole
@@ -56,13 +56,13 @@ def read_checked(path: Path) -> Iterator[Line]:
 
 def append_whole(descriptor: int, content: bytes) -> None:
     """Append all of it, or nothing: half a line would swallow the next one. Raises OSError."""
-    size, left = os.lseek(descriptor, 0, os.SEEK_END), content
+    size, remaining = os.lseek(descriptor, 0, os.SEEK_END), content
     try:
-        while left:
-            written = os.write(descriptor, left)
+        while remaining:
+            written = os.write(descriptor, remaining)
             if not written:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            left = left[written:]
+            remaining = remaining[written:]
     except OSError:
         os.ftruncate(descriptor, size)
         raise

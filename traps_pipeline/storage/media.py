@@ -63,8 +63,8 @@ class MediaSpec(BaseModel):
     later: int = Field(default=0, ge=0)
 
     def content(self) -> dict[str, Any]:
-        """The fields for a digest. One that came later counts only where it is used, so that what was made before it
-        keeps its digest."""
+        """Return the fields for a digest. One that came later counts only where it is used, so that what was made
+        before it keeps its digest."""
         unused = {name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default}
         return self.model_dump(mode="json", exclude=unused)
 
@@ -123,23 +123,23 @@ class Media:
 
 
 def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
-    """Indices of the frames that a model is shown, of a clip whose frames have these times (F,), s."""
+    """Return indices of the frames that a model is shown, of a clip whose frames have these times (F,), s."""
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
 def sample(clip: Path, spec: MediaSpec) -> Frames:
-    """The frames of a clip that a model sees. Raises DamagedClip."""
-    shown, times = decode(clip)
+    """Return the frames of a clip that a model sees. Raises DamagedClip."""
+    frames, times = decode(clip)
     chosen = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(resized(shown[chosen], spec.size, spec.fit), times[chosen], clip_fps)
+    return Frames(resized(frames[chosen], spec.size, spec.fit), times[chosen], clip_fps)
 
 
 def resized(
     frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch"
 ) -> np.ndarray:
-    """Frames (N, H, W, 3) uint8 at another width and height; as they are for None. With fit `crop` they keep their
-    shape: they are resized until they cover the size, and the middle of them is kept."""
+    """Return frames (N, H, W, 3) uint8 at another width and height; as they are for None. With fit `crop` they keep
+    their shape: they are resized until they cover the size, and the middle of them is kept."""
     import cv2
 
     if size is None or size == (frames.shape[2], frames.shape[1]):
@@ -165,7 +165,8 @@ class MediaStore:
         self._sound: dict[Path, Media] = {}  # by note: what this process has prepared, or has checked byte by byte
 
     def prepare(self, clip: Path, clip_digest: str, spec: MediaSpec) -> Media:
-        """What is sent of a clip, made once; a damaged or missing file is made anew. Blocks: call it in a thread.
+        """Return what is sent of a clip, made once; a damaged or missing file is made anew. Blocks: call it in a
+        thread.
 
         clip_digest: SHA-256 of the clip's file. Raises DamagedClip when the clip is not that or cannot be read,
         TrapsError when nothing can be written, or when a video cannot play at the clip's own frame rate.
@@ -182,7 +183,7 @@ class MediaStore:
         return self._sound[note]
 
     def known(self, clip_digest: str, spec: MediaSpec) -> Media | None:
-        """What is sent of a clip if it is prepared, else None: a quick look at note and size, for planning."""
+        """Return what is sent of a clip if it is prepared, else None: a quick look at note and size, for planning."""
         note = self._note(clip_digest, spec)
         if note in self._sound:
             return self._sound[note]
@@ -194,7 +195,7 @@ class MediaStore:
         self._store.bring([note] if path is None else [note, path])
 
     def _here(self, clip_digest: str, spec: MediaSpec) -> Media | None:
-        """What lies on this machine."""
+        """Return what lies on this machine."""
         try:
             media = read_note(self._note(clip_digest, spec))
             return media if media.path is None or media.path.stat().st_size == media.size_bytes else None
@@ -202,12 +203,12 @@ class MediaStore:
             return None
 
     def _note(self, clip_digest: str, spec: MediaSpec) -> Path:
-        """The small JSON that says what is prepared; written after it, so that it vouches for it."""
+        """Return the small JSON that says what is prepared; written after it, so that it vouches for it."""
         return self.folder / clip_digest[:2] / f"{clip_digest}-{profile_digest(spec)[:16]}.json"
 
 
 def read_note(note: Path) -> Media:
-    """What a note says is prepared. Raises ValueError naming it where it is not what was written, or OSError."""
+    """Return what a note says is prepared. Raises ValueError naming it where it is not what was written, or OSError."""
     (line, *more) = [*read_checked(note)] or [None]
     if line is None or more or not line.whole:
         raise ValueError(f"{note}: {NOT_WHOLE}; delete it and run again: it is prepared anew")
@@ -217,17 +218,17 @@ def read_note(note: Path) -> Media:
 
 
 def profile_digest(spec: MediaSpec) -> str:
-    """Digest of all that decides the bytes of a profile, the clip aside."""
-    made: dict[str, Any] = {"revision": _REVISION, "spec": spec.content()}
+    """Return digest of all that decides the bytes of a profile, the clip aside."""
+    content: dict[str, Any] = {"revision": _REVISION, "spec": spec.content()}
     if spec.profile == "video":
-        made["encoder"] = ENCODER
+        content["encoder"] = ENCODER
     if spec.profile == "images":
-        made["jpeg_quality"] = JPEG_QUALITY
-    return digest(made)
+        content["jpeg_quality"] = JPEG_QUALITY
+    return digest(content)
 
 
 def payload(media: Media) -> list[bytes]:
-    """The bytes to send: of the mp4, or of each JPEG in order.
+    """Return the bytes to send: of the mp4, or of each JPEG in order.
 
     Raises DamagedClip when the file is not what was prepared, TrapsError for profile frames.
     """
@@ -284,20 +285,21 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
 
 
 def _require(clip: Path, clip_digest: str) -> None:
-    """Raises DamagedClip unless the clip is the one that the prepared file will be filed under."""
+    """Raise DamagedClip unless the clip is the one that the prepared file will be filed under."""
     try:
-        found = file_digest(clip)
+        digest = file_digest(clip)
     except OSError as error:
         raise DamagedClip(f"{clip}: cannot be read ({error.strerror}); materialize videos again") from error
-    if found != clip_digest:
+    if digest != clip_digest:
         raise DamagedClip(
-            f"{clip}: is not the clip that was rendered (digest {found[:16]}, not {clip_digest[:16]}); "
+            f"{clip}: is not the clip that was rendered (digest {digest[:16]}, not {clip_digest[:16]}); "
             "delete the file and materialize videos again"
         )
 
 
 def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
-    """Frames a second at which the picked frames play: fps, or those of a slower clip, which would else be sped up."""
+    """Return frames a second at which the picked frames play: fps, or those of a slower clip, which would else be sped
+    up."""
     rate = min(spec.fps or 1, sampled.clip_fps or np.inf)
     if rate != int(rate):
         raise TrapsError(
@@ -307,11 +309,11 @@ def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
 
 
 def _sha256(parts: Sequence[bytes]) -> str:
-    """SHA-256 of all parts, one after another."""
-    made = hashlib.sha256()
+    """Return SHA-256 of all parts, one after another."""
+    hasher = hashlib.sha256()
     for part in parts:
-        made.update(part)
-    return made.hexdigest()
+        hasher.update(part)
+    return hasher.hexdigest()
 
 
 def _jpeg(frame: np.ndarray) -> bytes:
@@ -321,18 +323,20 @@ def _jpeg(frame: np.ndarray) -> bytes:
 
 
 def _zipped(jpegs: Sequence[bytes]) -> bytes:
-    """A zip of 00.jpg, 01.jpg, ..., uncompressed; the same images give the same bytes on every day and system."""
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as archive:
+    """Return a zip of 00.jpg, 01.jpg, ..., uncompressed; the same images give the same bytes on every day and
+    system.
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
         for i, jpeg in enumerate(jpegs):
             entry = zipfile.ZipInfo(f"{i:02d}.jpg", date_time=(1980, 1, 1, 0, 0, 0))
             entry.create_system = 3
             archive.writestr(entry, jpeg, zipfile.ZIP_STORED)
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 def _unzipped(data: bytes) -> list[bytes]:
-    """The entries of a zip in order. Raises one of `_NO_ZIP`."""
+    """Return the entries of a zip in order. Raises one of `_NO_ZIP`."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
             raise zipfile.BadZipFile("an entry is compressed")
@@ -372,17 +376,17 @@ class UriCache:
         self._kept: OrderedDict[tuple[Profile, str], tuple[str, ...]] = OrderedDict()
 
     def get(self, media: Media) -> tuple[str, ...]:
-        """The data URIs of `payload`, in order; raises what that raises."""
+        """Return the data URIs of `payload`, in order; raises what that raises."""
         key = (media.profile, media.sha256)
         with self._lock:
-            found = self._kept.get(key)
-            if found is None:
-                found = self._kept[key] = tuple(_data_uri(media.profile, part) for part in payload(media))
-                self.held_bytes += sum(map(len, found))
+            uri = self._kept.get(key)
+            if uri is None:
+                uri = self._kept[key] = tuple(_data_uri(media.profile, part) for part in payload(media))
+                self.held_bytes += sum(map(len, uri))
             self._kept.move_to_end(key)
             while self.held_bytes > self.most_bytes:
                 self.held_bytes -= sum(map(len, self._kept.popitem(last=False)[1]))
-        return found
+        return uri
 
 
 def _data_uri(profile: Profile, data: bytes) -> str:
@@ -393,5 +397,6 @@ _URIS = UriCache(CACHE_BYTES)
 
 
 def data_uris(media: Media) -> tuple[str, ...]:
-    """What `payload` gives as data URIs, from a cache that this process's calls share. Raises what `payload` raises."""
+    """Return what `payload` gives as data URIs, from a cache that this process's calls share. Raises what `payload`
+    raises."""
     return _URIS.get(media)

@@ -56,7 +56,7 @@ class StageOutput:
     beside: Any = None
 
     def rows(self, table: Table[Row]) -> Sequence[Row]:
-        """The rows of a table that is made row by row."""
+        """Return the rows of a table that is made row by row."""
         return cast("Sequence[Row]", self.content)
 
     @property
@@ -66,13 +66,13 @@ class StageOutput:
 
 
 def joined(parts: Sequence[StageOutput]) -> StageOutput:
-    """What parts of a partition were made of, as one: rows, tallies and numbers shown are added up."""
+    """Return what parts of a partition were made of, as one: rows, tallies and numbers shown are added up."""
     first, *others = parts
     for other in others:
         first.tally.add(other.tally)
     rows = [row for part in parts for row in part.content]
-    shown = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
-    return StageOutput(rows, first.tally, shown, first.beside)
+    figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
+    return StageOutput(rows, first.tally, figures, first.beside)
 
 
 class TableStore:
@@ -155,8 +155,8 @@ class TableStore:
         return data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
-        """What the footer of a partition says; None if it was never written, or by a version with other columns (it is
-        then made anew). Raises TrapsError if it is unreadable."""
+        """Return what the footer of a partition says; None if it was never written, or by a version with other columns
+        (it is then made anew). Raises TrapsError if it is unreadable."""
         import pyarrow as pa
 
         path = self.path(table, partition)
@@ -174,8 +174,8 @@ class TableStore:
             raise _unreadable(path, table, error) from error
 
     def damage(self, table: Table, partition: Mapping[str, Any], *, thorough: bool = False) -> str:
-        """What is wrong with a partition's file, in words; empty where its content is what was written, or where there
-        is no file.
+        """Return what is wrong with a partition's file, in words; empty where its content is what was written, or where
+        there is no file.
 
         The bytes of a file are held against the digest in it. thorough: what a store notes of it is not believed.
         """
@@ -193,23 +193,23 @@ class TableStore:
         return ""
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """One partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""
+        """Return one partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""
         return self._load(table, self.path(table, partition), columns).to_pandas()
 
     def records(
         self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
     ) -> Iterator[dict[str, Any]]:
-        """The rows of one partition as mappings, of which few are held at once. Raises as `read` does."""
+        """Yield the rows of one partition as mappings, of which few are held at once. Raises as `read` does."""
         for batch in self._load(table, self.path(table, partition), columns).to_batches(_ROWS_AT_ONCE):
             yield from batch.to_pylist()
 
     def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
-        """All partitions whose partition columns equal the given values (of several given, any of them); an empty frame
-        if there are none."""
+        """Return all partitions whose partition columns equal the given values (of several given, any of them); an
+        empty frame if there are none."""
         return self.read_arrow(table, columns, **equal).to_pandas()
 
     def read_arrow(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pa.Table:
-        """`read_all` as an Arrow table."""
+        """Return `read_all` as an Arrow table."""
         import pyarrow as pa
 
         strangers = sorted(set(equal) - set(table.partition_by))
@@ -224,7 +224,9 @@ class TableStore:
         return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
 
     def partitions(self, table: Table) -> list[dict[str, str]]:
-        """The partitions of a table that are there, in the order of their paths; values as the paths have them."""
+        """Return the partitions of a table that are there, in the order of their paths; values as the paths have
+        them.
+        """
         root = self.root / table.name
         paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
         values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
@@ -235,9 +237,9 @@ class TableStore:
         import pyarrow.parquet as pq
 
         try:
-            wanted = _wanted(table, columns)
-            data = pq.ParquetFile(_sound_bytes(self._store.here(path))).read(columns=wanted.names)
-            if not data.schema.equals(wanted):
+            names = _wanted(table, columns)
+            data = pq.ParquetFile(_sound_bytes(self._store.here(path))).read(columns=names.names)
+            if not data.schema.equals(names):
                 raise pa.ArrowInvalid("its columns are not those of this version")
             return data
         except FileNotFoundError:
@@ -252,19 +254,19 @@ def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) ->
 
 
 def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
-    """The bytes of a Parquet file with metadata and the digest of its own bytes in its footer."""
+    """Return the bytes of a Parquet file with metadata and the digest of its own bytes in its footer."""
     import pyarrow.parquet as pq
 
-    made = io.BytesIO()
-    pq.write_table(data.replace_schema_metadata({**metadata, _SUM: _MARK + _ZEROS}), made, compression="zstd")
-    content = made.getvalue()
-    made.seek(content.rfind(_MARK) + len(_MARK))
-    made.write(_sum_of(content))
-    return made.getvalue()
+    buffer = io.BytesIO()
+    pq.write_table(data.replace_schema_metadata({**metadata, _SUM: _MARK + _ZEROS}), buffer, compression="zstd")
+    content = buffer.getvalue()
+    buffer.seek(content.rfind(_MARK) + len(_MARK))
+    buffer.write(_sum_of(content))
+    return buffer.getvalue()
 
 
 def read_sealed(path: Path) -> pa.Table:
-    """A Parquet file if its bytes are what was written.
+    """Return a Parquet file if its bytes are what was written.
 
     Raises TrapsError if they are not, FileNotFoundError, and OSError or ArrowException if it is no Parquet file.
     """
@@ -274,7 +276,7 @@ def read_sealed(path: Path) -> pa.Table:
 
 
 def note_of(path: Path) -> str:
-    """What a store notes of a partition: its footer, and its columns. Raises TrapsError where it is not what was
+    """Return what a store notes of a partition: its footer, and its columns. Raises TrapsError where it is not what was
     written."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -291,7 +293,7 @@ def _note(footer: str, names: Sequence[str]) -> str:
 
 
 def _sum_of(content: bytes) -> bytes:
-    """The digest that belongs behind the last mark of a file's bytes: CRC-32, which finds every flipped bit at a
+    """Return the digest that belongs behind the last mark of a file's bytes: CRC-32, which finds every flipped bit at a
     fifteenth of what reading the table costs. What people alter is found by the rows' version."""
     place, view = content.rfind(_MARK) + len(_MARK), memoryview(content)
     return b"%08x" % crc32(view[place + len(_ZEROS) :], crc32(_ZEROS, crc32(view[:place])))
@@ -317,8 +319,8 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
 
 
 def _footer_of(path: Path) -> tuple[State, list[str]]:
-    """What a file's footer says, and the names of its columns; kept while its size and time are the same, since a run
-    asks for each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException."""
+    """Return what a file's footer says, and the names of its columns; kept while its size and time are the same, since
+    a run asks for each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException."""
     import pyarrow.parquet as pq
 
     stamp = _stamp(path.stat())
@@ -329,7 +331,7 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
 
 
 def altered(path: Path) -> str:
-    """What is wrong with the bytes of a table's file, in words; empty where they are what was written."""
+    """Return what is wrong with the bytes of a table's file, in words; empty where they are what was written."""
     try:
         _sound_bytes(path)
     except (TrapsError, OSError) as error:
@@ -337,12 +339,12 @@ def altered(path: Path) -> str:
     return ""
 
 
-def _stamp(found: os.stat_result) -> str:
-    return f"{found.st_mtime_ns} {found.st_size} {found.st_ino}"
+def _stamp(status: os.stat_result) -> str:
+    return f"{status.st_mtime_ns} {status.st_size} {status.st_ino}"
 
 
 def _column(rows: Sequence[Any], field: pa.Field) -> pa.Array:
-    """A column of rows, NaN as a missing value, which is what it is in a data frame."""
+    """Return a column of rows, NaN as a missing value, which is what it is in a data frame."""
     import pyarrow as pa
 
     values = (getattr(row, field.name, None) for row in rows)
@@ -351,7 +353,7 @@ def _column(rows: Sequence[Any], field: pa.Field) -> pa.Array:
 
 
 def _wanted(table: Table, columns: Sequence[str] | None) -> pa.Schema:
-    """The table's schema, or some columns of it in the schema's order."""
+    """Return the table's schema, or some columns of it in the schema's order."""
     import pyarrow as pa
 
     schema = table.arrow_schema()
@@ -363,7 +365,9 @@ def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
 
 
 def content_version(data: pa.Table) -> str:
-    """Digest of a table's content, volatile columns left out: unchanged content makes nothing downstream stale."""
+    """Return digest of a table's content, volatile columns left out: unchanged content makes nothing downstream
+    stale.
+    """
     lasting = data.drop_columns([c for c in VOLATILE if c in data.column_names])
     rows = (row for batch in lasting.to_batches(max_chunksize=_ROWS_AT_ONCE) for row in batch.to_pylist())
     return digest_of_list(rows)[:16]

@@ -19,7 +19,7 @@ Place = Path | str  # a folder, or an address s3://bucket/study
 
 
 def place_of(text: str) -> Place:
-    """What a person names: an address in an object store, or a folder. Raises TrapsError for another address."""
+    """Return what a person names: an address in an object store, or a folder. Raises TrapsError for another address."""
     if "://" not in text:
         folder = Path(text).absolute()
         require_history_path(folder)
@@ -34,11 +34,11 @@ def place_of(text: str) -> Place:
 
 
 def name_of(place: Place) -> str:
-    """A name that no study elsewhere has: the folder's, and a digest of where it was made."""
+    """Return a name that no study elsewhere has: the folder's, and a digest of where it was made."""
     plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
     return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
 
 
 def scratch_of(address: str) -> Path:
-    """The folder of this machine for the files of a study in an object store."""
+    """Return the folder of this machine for the files of a study in an object store."""
     return Path(os.environ.get(SCRATCH) or user_cache()).absolute() / name_of(address)

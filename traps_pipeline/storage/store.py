@@ -48,7 +48,7 @@ class Store(ABC):
 
     @abstractmethod
     def here(self, path: Path) -> Path:
-        """A file on this machine that holds what is current under that path; nobody changes it while it is read.
+        """Return a file on this machine that holds what is current under that path; nobody changes it while it is read.
 
         Raises FileNotFoundError where there is none, TrapsError where it is not what was written or cannot be had.
         """
@@ -73,19 +73,20 @@ class Store(ABC):
 
     @abstractmethod
     def has(self, path: Path) -> bool:
-        """Whether something is current under that path."""
+        """Return whether something is current under that path."""
 
     @abstractmethod
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """The sizes, in bytes, of those files that are really there."""
+        """Return the sizes, in bytes, of those files that are really there."""
 
     @abstractmethod
     def there(self, paths: Iterable[Path]) -> set[Path]:
-        """Those of these paths under which something is current. No content is looked for."""
+        """Return those of these paths under which something is current. No content is looked for."""
 
     @abstractmethod
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """The SHA-256, in hex, of what is current under these paths, as far as something is. No content is fetched."""
+        """Return the SHA-256, in hex, of what is current under these paths, as far as something is. No content is
+        fetched."""
 
     @abstractmethod
     def lease(self, name: str) -> Lease | None:
@@ -95,11 +96,13 @@ class Store(ABC):
 
     @abstractmethod
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
-        """The files below a folder whose paths from there match a pattern, hidden ones left out, in order."""
+        """Return the files below a folder whose paths from there match a pattern, hidden ones left out, in order."""
 
     @abstractmethod
     def note(self, path: Path) -> str | None:
-        """What was noted of a file when it was written; None where nothing was, and only the file itself tells."""
+        """Return what was noted of a file when it was written; None where nothing was, and only the file itself
+        tells.
+        """
 
     @abstractmethod
     def changed_ns(self, path: Path) -> int:
@@ -147,13 +150,13 @@ class FolderStore(Store):
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
         """See `Store`."""
-        found: dict[Path, int] = {}
+        size_of: dict[Path, int] = {}
         for path in paths:
             try:
-                found[path] = path.stat().st_size
+                size_of[path] = path.stat().st_size
             except OSError:
                 continue
-        return found
+        return size_of
 
     def there(self, paths: Iterable[Path]) -> set[Path]:
         """See `Store`."""
@@ -181,8 +184,8 @@ class FolderStore(Store):
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
-        found = (path for path in folder.glob(pattern) if path.is_file())
-        return sorted(path for path in found if not is_hidden(path.relative_to(folder)))
+        files = (path for path in folder.glob(pattern) if path.is_file())
+        return sorted(path for path in files if not is_hidden(path.relative_to(folder)))
 
     def note(self, path: Path) -> str | None:
         """See `Store`."""
@@ -198,7 +201,7 @@ class FolderStore(Store):
 
 @contextmanager
 def writable(folder: Path) -> Iterator[None]:
-    """Raises TrapsError where nothing can be written in a folder."""
+    """Raise TrapsError where nothing can be written in a folder."""
     try:
         yield
     except OSError as error:
@@ -206,5 +209,5 @@ def writable(folder: Path) -> Iterator[None]:
 
 
 def is_hidden(relative: Path) -> bool:
-    """Whether a file, or a folder on the way to it, has a name with a dot before it: locks, unfinished files."""
+    """Return whether a file, or a folder on the way to it, has a name with a dot before it: locks, unfinished files."""
     return any(part.startswith(".") for part in relative.parts)

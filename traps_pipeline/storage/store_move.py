@@ -59,16 +59,16 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
     while some := list(islice(files, AT_ONCE)):
         kept = list[Path]()
         for path in some:
-            there = target.root / path.relative_to(workspace.root)
+            destination = target.root / path.relative_to(workspace.root)
             if path.is_relative_to(workspace.tables.root):
                 try:
-                    target.store.write({there: path.read_bytes()}, note=note_of(path))
+                    target.store.write({destination: path.read_bytes()}, note=note_of(path))
                 except TrapsError as error:
                     progress.current().note(f"{error}; it is left, and made anew")
                 continue
-            there.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, there)
-            kept.append(there)
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, destination)
+            kept.append(destination)
         target.store.keep(kept)
         count += len(some)
         progress.current().note(f"{count} files lie in {target.place}")

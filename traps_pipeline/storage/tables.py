@@ -107,7 +107,7 @@ class Table(Generic[Row]):
         return [column.name for column in self.columns]
 
     def arrow_schema(self) -> pa.Schema:
-        """The schema that a written file has."""
+        """Return the schema that a written file has."""
         return self._schema
 
     @cached_property

@@ -53,20 +53,21 @@ class Workspace:
 
     @staticmethod
     def default_place() -> Place:
-        """`$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout, or, without one, in the current folder."""
+        """Return `$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout, or, without one, in the current
+        folder."""
         return place_of(os.environ.get(VARIABLE) or str(WORKSPACES / "default"))
 
     @staticmethod
     def is_there(place: Place) -> bool:
-        """Whether a study lies there. Raises TrapsError where an object store cannot be used."""
+        """Return whether a study lies there. Raises TrapsError where an object store cannot be used."""
         if isinstance(place, str):
             return several_hosts().open_store(place, scratch_of(place)) is not None
         return (place / STUDY).is_file()
 
     @staticmethod
     def file_of(place: Place, name: str) -> Path | None:
-        """A file at the top of a study, whether or not it can be opened; None where there is none. Raises TrapsError
-        where an object store cannot be used."""
+        """Return a file at the top of a study, whether or not it can be opened; None where there is none. Raises
+        TrapsError where an object store cannot be used."""
         if isinstance(place, str):
             root = scratch_of(place)
             store = several_hosts().open_store(place, root)
@@ -124,14 +125,15 @@ class Workspace:
         return self.study.mechanism
 
     def allow(self, **changes: Any) -> Workspace:
-        """The workspace with other values of fields that may change: budgets, prices, mechanism, experiments."""
+        """Return the workspace with other values of fields that may change: budgets, prices, mechanism, experiments."""
         changed = Workspace(self.root, self.study.model_copy(update=changes), self._address)
         changed.save_study()
         return changed
 
     @classmethod
     def open(cls, place: Place | None = None) -> Workspace:
-        """The workspace at a place (default: `default_place()`). Raises TrapsError naming the file and the remedy."""
+        """Return the workspace at a place (default: `default_place()`). Raises TrapsError naming the file and the
+        remedy."""
         place = place or cls.default_place()
         path = cls.file_of(place, STUDY)
         if path is None:
@@ -140,9 +142,9 @@ class Workspace:
             )
         data = read_yaml(path)
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            found = data.get("format") if isinstance(data, dict) else data
+            stated = data.get("format") if isinstance(data, dict) else data
             raise TrapsError(
-                f"{path}: workspace format {found!r}, this version reads {FORMAT}; use the version that made it, "
+                f"{path}: workspace format {stated!r}, this version reads {FORMAT}; use the version that made it, "
                 "or start a new workspace (its ledger folder can be copied over: answers keep their keys)"
             )
         study = parse_yaml_model(Study, data, path)
@@ -240,42 +242,44 @@ class Workspace:
         return SqliteDatabase(self.ledger_folder)
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
-        """File that exists while a check of a partition does not pass; it holds the details."""
+        """Return file that exists while a check of a partition does not pass; it holds the details."""
         return self.root / "checks" / stage / check / f"{key or stage}.json"
 
     def failed_checks(self, stage: str, key: str | None) -> list[str]:
-        """Names of the checks of a partition that do not pass."""
-        found = self.store.below(self.root / "checks" / stage, f"*/{key or stage}.json")
-        return sorted(path.parent.name for path in found)
+        """Return names of the checks of a partition that do not pass."""
+        files = self.store.below(self.root / "checks" / stage, f"*/{key or stage}.json")
+        return sorted(path.parent.name for path in files)
 
     def failure(self, stage: str, check: str, key: str | None) -> str:
-        """What is wrong where a check does not pass, as JSON."""
+        """Return what is wrong where a check does not pass, as JSON."""
         return self.store.here(self.failed_check(stage, check, key)).read_text(encoding="utf-8")
 
     def clip(self, scenario_id: str, side: str, scene_hash: str) -> Path:
-        """Path of a clip; its name holds the scene hash, so a corrected scene never overwrites what was judged."""
+        """Return path of a clip; its name holds the scene hash, so a corrected scene never overwrites what was
+        judged.
+        """
         return self.root / "clips" / scenario_id / f"{side}-{scene_hash[:16]}.mp4"
 
     def relative(self, path: Path) -> str:
-        """A path as tables store it."""
+        """Return a path as tables store it."""
         return path.relative_to(self.root).as_posix()
 
     def resolve(self, relative: str) -> Path:
-        """Inverse of `relative`: the file as it lies on this machine, if there is one."""
+        """Return inverse of `relative`: the file as it lies on this machine, if there is one."""
         self.store.bring([self.root / relative])
         return self.root / relative
 
     def bring(self, relatives: Iterable[str]) -> Path:
-        """The folder below which these files lie on this machine, as far as they exist. Raises TrapsError."""
+        """Return the folder below which these files lie on this machine, as far as they exist. Raises TrapsError."""
         self.store.bring(self.root / relative for relative in relatives)
         return self.root
 
     def bring_folder(self, folder: Path) -> Path:
-        """A folder of the study, after its files were brought to this machine. Raises TrapsError."""
+        """Return a folder of the study, after its files were brought to this machine. Raises TrapsError."""
         self.store.bring(self.store.below(folder))
         return folder
 
     def sizes(self, relatives: Iterable[str]) -> dict[str, int]:
-        """The sizes, in bytes, of those files that are there, wherever they lie."""
-        found = self.store.sizes(self.root / relative for relative in relatives)
-        return {self.relative(path): size for path, size in found.items()}
+        """Return the sizes, in bytes, of those files that are there, wherever they lie."""
+        size_of = self.store.sizes(self.root / relative for relative in relatives)
+        return {self.relative(path): size for path, size in size_of.items()}

@@ -28,7 +28,7 @@ class DamagedClip(ValueError):
 
 
 def frames_digest(frames: Sequence[np.ndarray]) -> str:
-    """SHA-256 over the raw RGB frames before encoding."""
+    """Return SHA-256 over the raw RGB frames before encoding."""
     digest = hashlib.sha256()
     for frame in frames:
         digest.update(np.ascontiguousarray(frame).tobytes())
@@ -65,7 +65,7 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
 
 
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """All frames (F, H, W, 3) uint8 RGB and their times (F,) in seconds. Raises DamagedClip."""
+    """Return all frames (F, H, W, 3) uint8 RGB and their times (F,) in seconds. Raises DamagedClip."""
     import av
     from av.error import FFmpegError
 
@@ -85,7 +85,7 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def count_frames(path: Path) -> int:
-    """How many frames a clip says that it has; nothing is decoded. Raises DamagedClip."""
+    """Return how many frames a clip says that it has; nothing is decoded. Raises DamagedClip."""
     import av
     from av.error import FFmpegError
 
@@ -99,7 +99,7 @@ def count_frames(path: Path) -> int:
 
 
 def decode_first(path: Path) -> np.ndarray:
-    """The first frame (H, W, 3) uint8 RGB alone. Raises DamagedClip."""
+    """Return the first frame (H, W, 3) uint8 RGB alone. Raises DamagedClip."""
     import av
     from av.error import FFmpegError
 
@@ -113,7 +113,7 @@ def decode_first(path: Path) -> np.ndarray:
 
 
 def decode_sampled(path: Path, shown: FramePolicy = SAMPLED) -> np.ndarray:
-    """The frames (N, H, W, 3) uint8 RGB that a policy shows, by default 5 a second and at most 25 (docs/spec.md 3.1).
-    Raises DamagedClip."""
+    """Return the frames (N, H, W, 3) uint8 RGB that a policy shows, by default 5 a second and at most 25 (docs/spec.md
+    3.1). Raises DamagedClip."""
     frames, times = decode(path)
     return frames[shown.pick(times)]

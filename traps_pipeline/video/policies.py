@@ -21,7 +21,8 @@ class FramePolicy:
         return f"{self.uniform} evenly spaced" if self.fps is None else f"{self.fps:g} a second"
 
     def pick(self, times: np.ndarray) -> np.ndarray:
-        """Indices of the frames nearest to the wanted times, none twice; of two that are equally near the earlier one.
+        """Return indices of the frames nearest to the wanted times, none twice; of two that are equally near the
+        earlier one.
 
         times: (F,) seconds, ascending. A grid starts at 0; uniform includes the first frame and the last one.
         """
@@ -44,26 +45,28 @@ POLICIES = (SAMPLED, FramePolicy(uniform=16), FramePolicy(fps=2, most=32))
 
 
 def shown_at_end(n_frames: int, fps: int, last_s: float, until: int | None = None) -> list[int]:
-    """Frames within the last so many seconds of a clip, or of what it shows before frame `until`, that some policy
-    shows; at least the last one of each policy."""
+    """Return frames within the last so many seconds of a clip, or of what it shows before frame `until`, that some
+    policy shows; at least the last one of each policy."""
     times = np.arange(n_frames) / fps
     end = n_frames if until is None else until
-    found: set[int] = set()
+    last_frames: set[int] = set()
     for policy in POLICIES:
         shown = policy.pick(times)
         shown = shown[shown < end]
         late = shown[times[shown] >= times[end - 1] - last_s - 1e-6]
-        found |= {int(i) for i in (late if late.size else shown[-1:])}
-    return sorted(found)
+        last_frames |= {int(i) for i in (late if late.size else shown[-1:])}
+    return sorted(last_frames)
 
 
 def last_of_all(n_frames: int, fps: int) -> int:
-    """The last frame of the policy that stops looking first: every policy shows this frame or a later one last."""
+    """Return the last frame of the policy that stops looking first: every policy shows this frame or a later one
+    last.
+    """
     times = np.arange(n_frames) / fps
     return min(int(policy.pick(times)[-1]) for policy in POLICIES)
 
 
 def fewest_within(n_frames: int, fps: int, span: tuple[int, int]) -> int:
-    """How many frames from the first of a span up to its end the policy that shows fewest of them shows."""
+    """Return how many frames from the first of a span up to its end the policy that shows fewest of them shows."""
     times = np.arange(n_frames) / fps
     return min(sum(span[0] <= int(i) < span[1] for i in policy.pick(times)) for policy in POLICIES)

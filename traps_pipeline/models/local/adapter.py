@@ -87,14 +87,14 @@ def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None
 
 
 def require_device(device: str) -> None:
-    """Raises TrapsError when this machine has no such device."""
+    """Raise TrapsError when this machine has no such device."""
     import torch
 
-    there = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
+    exists = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
     if device.startswith("cuda"):
         number = int(device.partition(":")[2] or 0)
-        there = torch.cuda.is_available() and number < torch.cuda.device_count()
-    if not there:
+        exists = torch.cuda.is_available() and number < torch.cuda.device_count()
+    if not exists:
         raise TrapsError(
             f"device {device}: torch {torch.__version__} finds none on this machine; run where there is one, or say "
             "`device: cpu` in the entry, which changes nothing but the speed in float32"
@@ -118,11 +118,11 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
             **options,
         )
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:400]
+        message = " ".join(str(error).split())[:400]
         raise TrapsError(
             f"checkpoint {checkpoint.name}: transformers {transformers.__version__} cannot load it as an "
-            f"image-text-to-text model ({type(error).__name__}: {said}); name a checkpoint of such a class, or save it "
-            "again with this version"
+            f"image-text-to-text model ({type(error).__name__}: {message}); name a checkpoint of such a class, or save "
+            "it again with this version"
         ) from error
     lacking = [*report["missing_keys"], *report["mismatched_keys"]]
     if lacking:
@@ -158,7 +158,7 @@ def _require_packable(network: Any, name: str) -> None:
 
 
 def _precision(params: LocalParams, device: str) -> dict[str, Any]:
-    """What `from_pretrained` is told about precision. Raises TrapsError without the library that NF4 needs."""
+    """Return what `from_pretrained` is told about precision. Raises TrapsError without the library that NF4 needs."""
     import torch
 
     options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}

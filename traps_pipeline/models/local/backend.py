@@ -59,7 +59,7 @@ class LocalBackend:
         self._running: asyncio.Task[None] | None = None
 
     async def ask(self, request: Request) -> Outcome:
-        """One attempt; see `Backend`. Raises TrapsError where asking again would not help."""
+        """Return one attempt; see `Backend`. Raises TrapsError where asking again would not help."""
         answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._waiting.requests.append(request)
         self._waiting.answers.append(answer)
@@ -94,15 +94,15 @@ class LocalBackend:
         with ThreadPoolExecutor(cores()) as pool:
             clips = list(pool.map(lambda request: _frames(request, self._spec), batch.requests))
         prompts = [
-            model.prompt(request.system, request.user, shown.frames, shown.times_s)
-            for request, shown in zip(batch.requests, clips, strict=True)
+            model.prompt(request.system, request.user, frames.frames, frames.times_s)
+            for request, frames in zip(batch.requests, clips, strict=True)
         ]
         sampling = None
         if self._params.temperature is not None and self._params.top_p is not None:
             sampling = Sampling(self._params.temperature, self._params.top_p, seeds(batch.requests))
-        made = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
+        generated = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model)
-                for one in made]  # fmt: skip
+                for one in generated]  # fmt: skip
 
 
 def _frames(request: Request, spec: MediaSpec) -> Frames:
@@ -114,12 +114,12 @@ def _frames(request: Request, spec: MediaSpec) -> Frames:
 
 
 def seeds(requests: Sequence[Request]) -> list[int]:
-    """A seed of each request's key: runs differ, and the same call gives the same answer."""
+    """Return a seed of each request's key: runs differ, and the same call gives the same answer."""
     return [int(request.key[:16], 16) for request in requests]
 
 
 def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
-    """The outcome of an answer: truncated where the limit cut it off, empty where nothing is left of it."""
+    """Return the outcome of an answer: truncated where the limit cut it off, empty where nothing is left of it."""
     text = text.strip()
     kind = ("truncated" if finish == "length" else "answer") if text else "empty"
     return Outcome(

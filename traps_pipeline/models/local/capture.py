@@ -33,13 +33,13 @@ class Captured:
 
 
 def first_tensor(output: Any) -> Tensor:
-    """The hidden states in what a module returned: blocks of some models return a tuple."""
+    """Return the hidden states in what a module returned: blocks of some models return a tuple."""
     return output[0] if isinstance(output, tuple) else output
 
 
 def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tensor:
-    """(1, T, d) to (d,): of the last token, in the model's precision, or the mean over all tokens, or over those that a
-    mask (T,) chooses, in float32.
+    """Return (1, T, d) to (d,): of the last token, in the model's precision, or the mean over all tokens, or over those
+    that a mask (T,) chooses, in float32.
 
     A copy: a view would keep the whole tensor alive.
     """

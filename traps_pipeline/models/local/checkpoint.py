@@ -37,13 +37,15 @@ class Checkpoint:
 
 
 def as_folder(name: str) -> Path | None:
-    """The folder that a `checkpoint:` names, relative to the checkout; None: it is a hub id."""
+    """Return the folder that a `checkpoint:` names, relative to the checkout; None: it is a hub id."""
     folder = ROOT / name
     return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
 
 
 def find_checkpoint(params: LocalParams) -> Checkpoint:
-    """The checkpoint that an entry names. Raises TrapsError, with the command that gets it, when it is not here."""
+    """Return the checkpoint that an entry names. Raises TrapsError, with the command that gets it, when it is not
+    here.
+    """
     require("local")
     folder = as_folder(params.checkpoint)
     if folder is not None:
@@ -61,8 +63,8 @@ def find_checkpoint(params: LocalParams) -> Checkpoint:
 
 
 def declared_digest(params: LocalParams) -> str | None:
-    """What stands for the weights in the ledger key, beside the entry: of a folder the digest of its content, of a hub
-    id the commit that is in the hub's cache.
+    """Return what stands for the weights in the ledger key, beside the entry: of a folder the digest of its content, of
+    a hub id the commit that is in the hub's cache.
 
     None for a hub id whose `revision` is a commit, and for one that is not downloaded: it can be planned, and is not
     asked before it is here (`find_checkpoint`). Raises TrapsError when the folder is not there.
@@ -78,13 +80,13 @@ def declared_digest(params: LocalParams) -> str | None:
 
 
 def download_command(params: LocalParams) -> str:
-    """What fetches a hub id's weights, where there is a network."""
+    """Return what fetches a hub id's weights, where there is a network."""
     at = f" --revision {params.revision}" if params.revision else ""
     return f"hf download {params.checkpoint}{at}"
 
 
 def _cached_snapshot(params: LocalParams) -> Path | None:
-    """The folder of a hub id in the hub's cache, named by its commit; None when it is not there."""
+    """Return the folder of a hub id in the hub's cache, named by its commit; None when it is not there."""
     if find_spec("huggingface_hub") is None:
         return None  # without the extra `local` the model can be planned; `find_checkpoint` then says what is missing
     from huggingface_hub import try_to_load_from_cache
@@ -98,7 +100,7 @@ def _cached_snapshot(params: LocalParams) -> Path | None:
 
 
 def _require_whole(folder: Path, name: str, remedy: str) -> None:
-    """Raises TrapsError unless configuration and all weights are there."""
+    """Raise TrapsError unless configuration and all weights are there."""
     try:
         index = folder / "model.safetensors.index.json"
         shards = set(json.loads(index.read_text())["weight_map"].values()) if index.exists() else {"model.safetensors"}
@@ -110,7 +112,7 @@ def _require_whole(folder: Path, name: str, remedy: str) -> None:
 
 
 def require_no_code(checkpoint: Checkpoint) -> None:
-    """Raises TrapsError for a checkpoint that brings code: it could do whatever its user can."""
+    """Raise TrapsError for a checkpoint that brings code: it could do whatever its user can."""
     code = [path.relative_to(checkpoint.folder).as_posix() for path in sorted(checkpoint.folder.rglob("*.py"))]
     for path in sorted(checkpoint.folder.glob("*.json")):
         if path.stat().st_size <= _CONFIG_BYTES and _names_code(path):
@@ -124,7 +126,7 @@ def require_no_code(checkpoint: Checkpoint) -> None:
 
 
 def _names_code(path: Path) -> bool:
-    """Whether settings name classes of a checkpoint's own files, however the name is spelt in JSON."""
+    """Return whether settings name classes of a checkpoint's own files, however the name is spelt in JSON."""
     try:
         return '"auto_map"' in json.dumps(json.loads(path.read_bytes()))
     except (ValueError, RecursionError):
@@ -132,7 +134,7 @@ def _names_code(path: Path) -> bool:
 
 
 def folder_digest(folder: Path) -> str:
-    """Digest of a checkpoint folder's content, wherever it lies; computed anew only when a file changed."""
+    """Return digest of a checkpoint folder's content, wherever it lies; computed anew only when a file changed."""
     files = sorted(path for path in folder.iterdir() if path.suffix in _FILES)
     stamps = tuple((path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files)
     return _content_digest(folder, stamps)
@@ -147,7 +149,7 @@ def _content_digest(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> s
 
 
 def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> float:
-    """Memory that the weights take when loaded so, in bytes, from the headers of their files."""
+    """Return memory that the weights take when loaded so, in bytes, from the headers of their files."""
     weights = sum(math.prod(shape) for file in sorted(folder.glob("*.safetensors")) for shape in _shapes(file))
     return weights * (_NF4_BYTES if quantisation == "nf4" else _ITEM_BYTES[dtype])
 
@@ -182,7 +184,7 @@ def free_bytes(device: str) -> float:
 
 
 def require_memory(checkpoint: Checkpoint, dtype: Dtype, quantisation: Quantisation, device: str) -> None:
-    """Raises TrapsError when the weights alone do not fit."""
+    """Raise TrapsError when the weights alone do not fit."""
     needed, free = weight_bytes(checkpoint.folder, dtype, quantisation), free_bytes(device)
     if needed > free:
         raise TrapsError(

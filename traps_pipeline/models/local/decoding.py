@@ -20,7 +20,7 @@ class Decodes(Protocol):
     network: Any
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Inputs on the model's device."""
+        """Return inputs on the model's device."""
         ...
 
 
@@ -37,7 +37,7 @@ class Steers(Protocol):
 
 
 def steered(steering: Steers | None, model: Decodes) -> AbstractContextManager[None]:
-    """The steering, or nothing."""
+    """Return the steering, or nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 

@@ -17,7 +17,7 @@ from traps_pipeline.base.extras import require
 
 @cache
 def load_transformers() -> Any:
-    """The library, told to send nothing and to say only errors. Raises TrapsError where it is not installed."""
+    """Return the library, told to send nothing and to say only errors. Raises TrapsError where it is not installed."""
     require("local")
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")

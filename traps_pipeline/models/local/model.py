@@ -115,7 +115,7 @@ class LocalModel:
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def block(self, layer: int) -> Module:
-        """The block whose output is hidden_states[layer]. Raises TrapsError for a layer that is out of range."""
+        """Return the block whose output is hidden_states[layer]. Raises TrapsError for a layer that is out of range."""
         if not 1 <= layer <= self.n_layers:
             raise TrapsError(
                 f"{self.checkpoint.name}: no block {layer}; it has blocks 1 to {self.n_layers} (layer 0 are the "
@@ -126,7 +126,7 @@ class LocalModel:
     # --- prompts ------------------------------------------------------------------------------------------------------
 
     def prompt(self, system: str, user: str, frames: np.ndarray, times_s: Sequence[float] | np.ndarray) -> Prompt:
-        """System prompt, then clip and question, nothing else (docs/spec.md 3.3).
+        """Return system prompt, then clip and question, nothing else (docs/spec.md 3.3).
 
         frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
         time stamps get exactly. Raises TrapsError when the chat template loses a part.
@@ -137,7 +137,7 @@ class LocalModel:
                  "duration": marks[-1] / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
         bos = self.processor.tokenizer.bos_token
         with self._processing:
-            made = self.processor(
+            inputs = self.processor(
                 text=[text],
                 videos=[np.ascontiguousarray(frames)],
                 video_metadata=[clock],
@@ -146,8 +146,8 @@ class LocalModel:
                 add_special_tokens=not (bos and text.startswith(bos)),
                 **self.params.video,
             )
-        made.pop("video_metadata", None)
-        return Prompt(text, dict(made))
+        inputs.pop("video_metadata", None)
+        return Prompt(text, dict(inputs))
 
     def _rendered(self, system: str, user: str) -> str:
         content = [{"type": "video"}, {"type": "text", "text": user}]
@@ -170,7 +170,7 @@ class LocalModel:
     # --- hidden states ------------------------------------------------------------------------------------------------
 
     def forward(self, prompt: Prompt) -> Any:
-        """One bare pass over a prompt, without logits; returns the library's output. No gradients."""
+        """Return one bare pass over a prompt, without logits; returns the library's output. No gradients."""
         import torch
 
         with torch.inference_mode():
@@ -183,7 +183,8 @@ class LocalModel:
         steering: Steers | None = None,
         chosen: np.ndarray | None = None,
     ) -> States:
-        """The hidden states of every layer, of one prompt: batch size 1, so that in 16 bits no other prompt matters.
+        """Return the hidden states of every layer, of one prompt: batch size 1, so that in 16 bits no other prompt
+        matters.
 
         chosen: for poolings over a part of the prompt, its tokens (T,) bool. `answer` generates the first token of the
         greedy answer, and takes the state at it.
@@ -200,7 +201,7 @@ class LocalModel:
         return States(rows[:-1], rows[-1])
 
     def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
-        """The prompt with the first token of its greedy answer behind it."""
+        """Return the prompt with the first token of its greedy answer behind it."""
         return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
     # --- answers ------------------------------------------------------------------------------------------------------
@@ -215,8 +216,8 @@ class LocalModel:
         use_cache: bool = True,
         stopped: Callable[[], bool] = lambda: False,
     ) -> list[Generated]:
-        """An answer to each prompt, in order; greedy unless sampling is given. Batches are sized to memory, and halved
-        where that was too much; no answer depends on them but through rounding in 16 bits.
+        """Return an answer to each prompt, in order; greedy unless sampling is given. Batches are sized to memory, and
+        halved where that was too much; no answer depends on them but through rounding in 16 bits.
 
         sampling, steering: one row a prompt. stopped: asked at every token, ends early. Raises TrapsError when one
         prompt alone does not fit.
@@ -227,12 +228,12 @@ class LocalModel:
             pending = [group]
             while pending:
                 rows = pending.pop()
-                made = self._fitting(prompts, rows, max_new_tokens, sampling, steering, use_cache, stopped)
-                if made is None:
+                generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, use_cache, stopped)
+                if generated is None:
                     half = len(rows) // 2
                     pending += [rows[half:], rows[:half]]
                 else:
-                    answers.update(zip(rows, made, strict=True))
+                    answers.update(zip(rows, generated, strict=True))
         return [answers[i] for i in range(len(prompts))]
 
     def _fitting(
@@ -245,7 +246,7 @@ class LocalModel:
         use_cache: bool,
         stopped: Callable[[], bool],
     ) -> list[Generated] | None:
-        """The answers of a batch; None if it must be halved."""
+        """Return the answers of a batch; None if it must be halved."""
         import torch
 
         try:
@@ -290,7 +291,7 @@ class LocalModel:
         return Generated(text, prompt.n_tokens, len(kept), "length" if ended is None else "stop", tuple(kept))
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Inputs of a prompt or a batch, on the model's device, pictures in its precision."""
+        """Return inputs of a prompt or a batch, on the model's device, pictures in its precision."""
         dtype, device = self.network.dtype, self.inputs_device
         return {
             name: value.to(device, dtype) if value.is_floating_point() else value.to(device)
@@ -298,7 +299,8 @@ class LocalModel:
         }
 
     def _row_bytes(self, prompt: Prompt, max_new_tokens: int) -> float:
-        """Memory that a row takes at most, by estimate: keys and values, the widest activations, pictures, logits."""
+        """Return memory that a row takes at most, by estimate: keys and values, the widest activations, pictures,
+        logits."""
         item, vocabulary = self.network.dtype.itemsize, self.network.config.get_text_config().vocab_size
         kept = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
         passing = 28 * prompt.n_tokens * self.d_model * item  # a block's widest moment: residual, gate, up and down
@@ -318,14 +320,16 @@ def _first(tokens: int | Sequence[int]) -> int:
 
 
 def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:
-    """Blocks and final norm of the language model. Raises TrapsError for a model that is built in another way."""
+    """Return blocks and final norm of the language model. Raises TrapsError for a model that is built in another
+    way.
+    """
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks, norm = getattr(decoder, "layers", None), getattr(decoder, "norm", None)
     expected = getattr(network.config.get_text_config(), "num_hidden_layers", None)
     if blocks is None or norm is None or len(blocks) != expected:
-        found = "none" if blocks is None else len(blocks)
+        count = "none" if blocks is None else len(blocks)
         raise TrapsError(
-            f"checkpoint {name}: {type(network).__name__} has not the expected layers (get_decoder().layers: {found}, "
+            f"checkpoint {name}: {type(network).__name__} has not the expected layers (get_decoder().layers: {count}, "
             f"its configuration says {expected}; final norm: {'missing' if norm is None else 'there'}): the adapter "
             "cannot look inside it"
         )

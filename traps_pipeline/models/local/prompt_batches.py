@@ -29,11 +29,11 @@ class Prompt:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the inputs: equal for equal prompts about equal clips."""
-        whole = hashlib.sha256()
+        hasher = hashlib.sha256()
         for name, value in sorted(self.inputs.items()):
-            whole.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-            whole.update(value.detach().cpu().contiguous().numpy().tobytes())
-        return whole.hexdigest()
+            hasher.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+            hasher.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return hasher.hexdigest()
 
     @property
     def sequences(self) -> list[str]:
@@ -59,7 +59,7 @@ class Prompt:
 
 
 def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
-    """One batch: what has a value a token is padded on the left, the rest is put one after another."""
+    """Return one batch: what has a value a token is padded on the left, the rest is put one after another."""
     import torch
 
     width = max(prompt.n_tokens for prompt in prompts)
@@ -74,7 +74,9 @@ def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
 
 
 def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
-    """Indices of prompts that go together: of one form, of similar length, as many as fit into the room (bytes)."""
+    """Yield indices of prompts that go together: of one form, of similar length, as many as fit into the room
+    (bytes).
+    """
     by_form: defaultdict[Any, list[int]] = defaultdict(list)
     for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):
         by_form[prompts[i].form].append(i)

@@ -25,7 +25,8 @@ _NF4_SKIP = ("model.visual", "lm_head")
 
 
 def tiny_model(family: Family, folder: Path, quantisation: Quantisation = "none") -> LocalModel:
-    """A tiny checkpoint of a family in a folder, where it is built unless it is there, loaded by the real classes."""
+    """Return a tiny checkpoint of a family in a folder, where it is built unless it is there, loaded by the real
+    classes."""
     build_tiny(family, folder)
     params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": quantisation}
     params |= {"do_sample": False, "max_new_tokens": 8, "nf4_skip": _NF4_SKIP if quantisation == "nf4" else ()}
@@ -35,8 +36,8 @@ def tiny_model(family: Family, folder: Path, quantisation: Quantisation = "none"
 def _prompt(model: LocalModel, folder: Path) -> Prompt:
     clip = folder / "clip.mp4"
     encode([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 20)], clip, fps=10)
-    shown = sample(clip, _SPEC)
-    return model.prompt(_SYSTEM, _QUESTION, shown.frames, shown.times_s)
+    frames = sample(clip, _SPEC)
+    return model.prompt(_SYSTEM, _QUESTION, frames.frames, frames.times_s)
 
 
 def check_family(family: Family, folder: Path) -> str:
@@ -61,18 +62,20 @@ def check_nf4(folder: Path) -> str:
 
 
 def describe_devices() -> str:
-    """Which devices torch finds."""
+    """Return which devices torch finds."""
     import torch
 
     versions = f"torch {torch.__version__}, transformers {load_transformers().__version__}"
     if not torch.cuda.is_available():
         return f"{versions}: no GPU; models of 7-8 B parameters want one of 24 GB or more, the pocket model does not"
-    found = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
-    return f"{versions}: " + ", ".join(f"cuda:{i} {p.name} {p.total_memory / 1e9:.0f} GB" for i, p in enumerate(found))
+    devices = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+    return f"{versions}: " + ", ".join(
+        f"cuda:{i} {p.name} {p.total_memory / 1e9:.0f} GB" for i, p in enumerate(devices)
+    )
 
 
 def describe_checkpoints() -> str:
-    """Which local models of the registry have their weights here."""
+    """Return which local models of the registry have their weights here."""
     return "; ".join(_whereabouts(entry) for entry in load_models().values() if entry.backend == LOCAL)
 
 

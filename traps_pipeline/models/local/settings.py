@@ -36,11 +36,11 @@ class LocalParams(BaseModel):
 
     @model_validator(mode="after")
     def _sampling_is_whole(self) -> LocalParams:
-        given = [name for name in ("temperature", "top_p") if getattr(self, name) is not None]
-        if self.do_sample and len(given) != 2:
+        declared = [name for name in ("temperature", "top_p") if getattr(self, name) is not None]
+        if self.do_sample and len(declared) != 2:
             raise ValueError("do_sample: true needs temperature and top_p (1.0 for all tokens)")
-        if not self.do_sample and given:
-            raise ValueError(f"do_sample: false is greedy, and {given[0]} has no effect; leave it out")
+        if not self.do_sample and declared:
+            raise ValueError(f"do_sample: false is greedy, and {declared[0]} has no effect; leave it out")
         if self.nf4_skip and self.quantisation != "nf4":
             raise ValueError("nf4_skip goes with quantisation: nf4")
         return self
@@ -72,7 +72,7 @@ class MechanismSpec(BaseModel):
         return self
 
     def inside(self, params: LocalParams) -> LocalParams:
-        """The parameters that the model is looked into with."""
+        """Return the parameters that the model is looked into with."""
         if self.quantisation in (None, params.quantisation) and not self.nf4_skip:
             return params
         return params.model_copy(update={"quantisation": self.quantisation, "nf4_skip": self.nf4_skip})

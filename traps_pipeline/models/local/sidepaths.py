@@ -31,8 +31,8 @@ _FIELDS: dict[str, tuple[Argument | None, str]] = {
 
 
 def unknown_path(config: Any, block: Module) -> str | None:
-    """Which path of a language model's configuration is in none of its blocks' known arguments, in words and by the
-    name of its field; None if there is no such path."""
+    """Return which path of a language model's configuration is in none of its blocks' known arguments, in words and by
+    the name of its field; None if there is no such path."""
     for field, (argument, what) in _FIELDS.items():
         if getattr(config, field, 0) and argument not in _arguments(type(block)):
             return f"{what} ({field})"
@@ -40,7 +40,7 @@ def unknown_path(config: Any, block: Module) -> str | None:
 
 
 def given(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """What a call of a block gives it as an argument; None if it has no such argument or is given none."""
+    """Return what a call of a block gives it as an argument; None if it has no such argument or is given none."""
     names = _arguments(type(block))
     place = names.index(name) if name in names else len(args)
     return args[place] if place < len(args) else kwargs.get(name)
@@ -49,7 +49,7 @@ def given(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str
 def giving(
     block: Module, name: Argument, value: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments of a call of a block with another value for one of them."""
+    """Return the arguments of a call of a block with another value for one of them."""
     place = _arguments(type(block)).index(name)
     if place < len(args):
         return (*args[:place], value, *args[place + 1 :]), kwargs

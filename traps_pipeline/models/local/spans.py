@@ -33,39 +33,39 @@ def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict
         for token, is_visual in zip(ids, visual, strict=True)
     ]
     ends = np.cumsum([len(text) for text in texts])
-    starts, whole = ends - [len(text) for text in texts], "".join(texts)
+    starts, joined = ends - [len(text) for text in texts], "".join(texts)
 
     def tokens(first: int, last: int) -> np.ndarray:
         return (starts < last) & (ends > first)
 
-    found = {name: np.zeros(len(ids), bool) for name in PARTS}
-    found["visual"] = visual
+    masks = {name: np.zeros(len(ids), bool) for name in PARTS}
+    masks["visual"] = visual
     for name, text in (("system", system), ("question", question)):
         plain = _plain(text)
-        place = whole.rfind(plain) if name == "question" else whole.find(plain)
+        place = joined.rfind(plain) if name == "question" else joined.find(plain)
         if place < 0 or not plain:
             raise TrapsError(
                 f"{model.checkpoint.name}: the {name} cannot be found among the tokens of its prompt; its tokenizer "
                 "changes texts, so positions cannot be chosen by part"
             )
-        found[name] = tokens(place, place + len(plain)) & ~visual
-    between = int(np.flatnonzero(found["system"])[-1]) + 1, int(np.flatnonzero(found["question"])[0])
-    for first, last in _stamps(whole, int(starts[between[0]]), int(starts[between[1]])):
-        found["stamps"] |= tokens(first, last) & ~visual
-    found["last"][-1] = True
+        masks[name] = tokens(place, place + len(plain)) & ~visual
+    between = int(np.flatnonzero(masks["system"])[-1]) + 1, int(np.flatnonzero(masks["question"])[0])
+    for first, last in _stamps(joined, int(starts[between[0]]), int(starts[between[1]])):
+        masks["stamps"] |= tokens(first, last) & ~visual
+    masks["last"][-1] = True
     for name in PARTS[:-1]:
-        found[name] &= ~found["last"]
-    return found
+        masks[name] &= ~masks["last"]
+    return masks
 
 
 def visual_tokens(model: LocalModel, prompt: Prompt) -> np.ndarray:
-    """Which tokens of a prompt stand for pictures, (T,) bool."""
+    """Return which tokens of a prompt stand for pictures, (T,) bool."""
     placeholders = {getattr(model.processor, f"{kind}_token_id", None) for kind in ("image", "video")}
     return np.isin(prompt.inputs["input_ids"][0].tolist(), [token for token in placeholders if token is not None])
 
 
 def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray | None:
-    """The visual tokens (T,) of a prompt whose pixels differ from those of another one, (T,) bool.
+    """Return the visual tokens (T,) of a prompt whose pixels differ from those of another one, (T,) bool.
 
     None where the clips do not give as many pixels, or the processor's pixels do not come token by token. Qwen's do:
     the patches that are merged into one token follow each other.
@@ -81,8 +81,8 @@ def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray
     return changed
 
 
-def _stamps(whole: str, first: int, last: int) -> Iterator[tuple[int, int]]:
-    for match in _STAMP.finditer(whole, first, last):
+def _stamps(text: str, first: int, last: int) -> Iterator[tuple[int, int]]:
+    for match in _STAMP.finditer(text, first, last):
         yield match.span()
 
 

@@ -113,7 +113,8 @@ def build_tiny(
 
 
 def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
-    """A tokenizer of transformers with the family's special tokens after those that it has; by default one a byte."""
+    """Return a tokenizer of transformers with the family's special tokens after those that it has; by default one a
+    byte."""
     transformers = load_transformers()
     special = _SPECIAL[family]
     base = _byte_level() if tokenizer is None else tokenizer
@@ -137,18 +138,18 @@ def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
 
 
 def _byte_level() -> Tokenizer:
-    """Every byte of a text is a token: any text can be read and written."""
+    """Return every byte of a text is a token: any text can be read and written."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers
 
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-    made = Tokenizer(models.BPE(vocab={character: i for i, character in enumerate(alphabet)}, merges=[]))
-    made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)  # pyright: ignore[reportAttributeAccessIssue]
-    made.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
-    return made
+    tokenizer = Tokenizer(models.BPE(vocab={character: i for i, character in enumerate(alphabet)}, merges=[]))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)  # pyright: ignore[reportAttributeAccessIssue]
+    tokenizer.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
+    return tokenizer
 
 
 def make_config(family: Family, tokenizer: Any, text: Overrides | None = None, vision: Overrides | None = None) -> Any:
-    """The family's configuration for a tokenizer of `make_tokenizer`: tiny, but for what is overridden."""
+    """Return the family's configuration for a tokenizer of `make_tokenizer`: tiny, but for what is overridden."""
     transformers = load_transformers()
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _SPECIAL[family].items()}
     shared = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
@@ -254,7 +255,8 @@ def _llava_next_video(
 
 
 def make_processor(family: Family, tokenizer: Any, video: Overrides | None = None) -> Any:
-    """The family's processor around a tokenizer of `make_tokenizer`; `video` overrides its video processor's fields."""
+    """Return the family's processor around a tokenizer of `make_tokenizer`; `video` overrides its video processor's
+    fields."""
     transformers = load_transformers()
     asked = dict(video or {})
     match family:

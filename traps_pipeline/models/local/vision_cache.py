@@ -81,25 +81,27 @@ class ClipMemory:
             del owner.get_video_features  # the class's own method is found again
 
     def _pass(self, original: Any, key: str, asked: dict[str, Any]) -> _Features:
-        made = original(**asked)
-        self._form = type(made), isinstance(made.pooler_output, tuple | list)
+        output = original(**asked)
+        self._form = type(output), isinstance(output.pooler_output, tuple | list)
         self.passes += 1
-        tokens = made.pooler_output[0] if self._form[1] else made.pooler_output
-        layers = getattr(made, "deepstack_features", None) or ()
-        found = _Features(tokens.clone(), tuple(layer[0].clone() for layer in layers))
-        self._keep(key, found)
-        return found
+        tokens = output.pooler_output[0] if self._form[1] else output.pooler_output
+        layers = getattr(output, "deepstack_features", None) or ()
+        features = _Features(tokens.clone(), tuple(layer[0].clone() for layer in layers))
+        self._keep(key, features)
+        return features
 
     def _joined(self, rows: list[_Features]) -> Any:
-        """What the library returns of these clips together."""
+        """Return what the library returns of these clips together."""
         import torch
 
         make, is_tuple = self._form
         tokens = [row.tokens for row in rows]
-        given: dict[str, Any] = {"pooler_output": tuple(tokens) if is_tuple else torch.cat(tokens)}
+        fields: dict[str, Any] = {"pooler_output": tuple(tokens) if is_tuple else torch.cat(tokens)}
         if rows[0].deepstack:
-            given["deepstack_features"] = [tuple(layer) for layer in zip(*(row.deepstack for row in rows), strict=True)]
-        return make(**given)
+            fields["deepstack_features"] = [
+                tuple(layer) for layer in zip(*(row.deepstack for row in rows), strict=True)
+            ]
+        return make(**fields)
 
     def _keep(self, key: str, features: _Features) -> None:
         self._kept[key] = features
@@ -110,7 +112,7 @@ class ClipMemory:
 
 
 def _clips_of(asked: dict[str, Any]) -> list[dict[str, Tensor]] | None:
-    """The arguments of each clip alone; None where a class does not say which pixels are whose."""
+    """Return the arguments of each clip alone; None where a class does not say which pixels are whose."""
     pixels, grids = asked["pixel_values_videos"], asked.get("video_grid_thw")
     if grids is not None:  # Qwen3-VL: patches of all clips one after the other, and how many each has
         parts = pixels.split(grids.prod(-1).tolist())
@@ -128,8 +130,8 @@ def _clips_of(asked: dict[str, Any]) -> list[dict[str, Tensor]] | None:
 
 
 def _key(clip: dict[str, Tensor]) -> str:
-    whole = hashlib.sha256()
+    hasher = hashlib.sha256()
     for name, part in clip.items():
-        whole.update(f"{name} {tuple(part.shape)}".encode())
-        whole.update(part.detach().cpu().contiguous().view(-1).float().numpy().tobytes())
-    return whole.hexdigest()
+        hasher.update(f"{name} {tuple(part.shape)}".encode())
+        hasher.update(part.detach().cpu().contiguous().view(-1).float().numpy().tobytes())
+    return hasher.hexdigest()

@@ -39,17 +39,17 @@ category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonom
 
 
 def _make_specs(workspace: Workspace, category: str) -> StageOutput:
-    """Scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated here,
-    once."""
+    """Return scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated
+    here, once."""
     rows, resolved = build_specs(workspace, category)
     return StageOutput(rows, beside=resolved)
 
 
 def _evidence(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
-    def wrong(workspace: Workspace, key: str | None, made: StageOutput) -> Any:
+    def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> Any:
         from traps_pipeline.benchmark import stored_evidence as evidence
 
-        return getattr(evidence, find)([item.spec for item in made.beside])
+        return getattr(evidence, find)([item.spec for item in output.beside])
 
     return wrong
 
@@ -103,7 +103,7 @@ scene_specs = stage(
 
 
 def _make_videos(workspace: Workspace, category: str) -> StageOutput:
-    """Control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
+    """Return control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
     whichever of the processes that are at it."""
     from traps_pipeline.benchmark.videos import build_videos
 
@@ -124,9 +124,9 @@ def _to_render_s(workspace: Workspace, category: str) -> float:
     return seconds_left(workspace, category)
 
 
-def _alike(workspace: Workspace, key: str | None, made: StageOutput) -> list[str]:
-    shown = Counter((row.side, row.frames_sha256) for row in made.rows(VIDEOS))
-    return [row.path for row in made.rows(VIDEOS) if shown[row.side, row.frames_sha256] > 1]
+def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[str]:
+    counts = Counter((row.side, row.frames_sha256) for row in output.rows(VIDEOS))
+    return [row.path for row in output.rows(VIDEOS) if counts[row.side, row.frames_sha256] > 1]
 
 
 videos = stage(
@@ -152,7 +152,8 @@ videos = stage(
 
 
 def _make_arms(workspace: Workspace, category: str) -> StageOutput:
-    """The arms and variations of a category's scenarios that the study asks: clips and questions beside the pairs."""
+    """Return the arms and variations of a category's scenarios that the study asks: clips and questions beside the
+    pairs."""
     from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
@@ -195,16 +196,17 @@ arms = stage(
 
 
 def _make_items(workspace: Workspace, dataset: str) -> StageOutput:
-    """The items that models are asked, two per pair: the control, and the void that differs from it by one change."""
+    """Return the items that models are asked, two per pair: the control, and the void that differs from it by one
+    change."""
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})
 
 
-def _odd_pairs(workspace: Workspace, key: str | None, made: StageOutput) -> dict[str, list[str]]:
+def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> dict[str, list[str]]:
     sides: dict[str, list[str]] = {}
-    for row in made.rows(ITEMS):
+    for row in output.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)
     return {pair: found for pair, found in sides.items() if tuple(sorted(found)) != sides_of(str(key))}
 

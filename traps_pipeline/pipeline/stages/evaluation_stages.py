@@ -53,12 +53,14 @@ judges = source(
 
 
 def _collect_answers(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Answers of a model under a regime in a run, one row per item; answers in the ledger are not asked again."""
+    """Return answers of a model under a regime in a run, one row per item; answers in the ledger are not asked
+    again.
+    """
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 
 def _collect_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
+    """Return votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 
@@ -66,13 +68,16 @@ def _with_items(
     workspace: Workspace, cells: Iterator[tuple[Cell, StageOutput]]
 ) -> Iterator[tuple[str | None, StageOutput]]:
     """Add a cell's items to what is shown of it."""
-    for cell, made in cells:
-        shown = {**made.shown, **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], made.content))}
-        yield cell.key, StageOutput(made.content, made.tally, shown)
+    for cell, output in cells:
+        figures = {
+            **output.shown,
+            **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], output.content)),
+        }
+        yield cell.key, StageOutput(output.content, output.tally, figures)
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
-    """Metadata about a cell's items: a table of those without an answer, and the explorer's view of all."""
+    """Return metadata about a cell's items: a table of those without an answer, and the explorer's view of all."""
     from traps_pipeline.report.cards import explorer_address
     from traps_pipeline.report.writing import Behind
 
@@ -86,10 +91,10 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **why}
 
 
-def _answers_missing(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
     n_items = state.rows if state else 0
-    n_rows = len(made.rows(RESPONSES))
+    n_rows = len(output.rows(RESPONSES))
     return "" if n_rows == n_items else f"{n_rows} rows for {n_items} items"
 
 
@@ -109,8 +114,8 @@ responses = stage(
 )
 
 
-def _many_invalid(workspace: Workspace, key: str | None, made: StageOutput) -> str:
-    cast_votes = made.rows(VOTES)
+def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
+    cast_votes = output.rows(VOTES)
     invalid = sum(not vote.valid for vote in cast_votes)
     many = invalid > MAX_INVALID_SHARE * len(cast_votes)
     return f"{invalid} of {len(cast_votes)} votes are invalid" if many else ""
@@ -136,17 +141,17 @@ votes = stage(
 
 
 def _make_verdicts(workspace: Workspace, key: str) -> StageOutput:
-    """The verdict of the panel's majority on each item of a cell."""
+    """Return the verdict of the panel's majority on each item of a cell."""
     from traps_pipeline.judging.verdicts import decide_cell
 
     rows = decide_cell(workspace, Cell.parse(key))
     return StageOutput(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
 
 
-def _verdicts_missing(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
     n_answers = answered.rows if answered else 0
-    return "" if n_answers == len(made.frame) else f"{len(made.frame)} verdicts for {n_answers} answers"
+    return "" if n_answers == len(output.frame) else f"{len(output.frame)} verdicts for {n_answers} answers"
 
 
 verdicts = stage(

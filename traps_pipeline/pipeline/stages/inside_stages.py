@@ -63,7 +63,7 @@ sentence_settings = source(
 
 
 def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
-    """The model of an extraction, and the extraction."""
+    """Return the model of an extraction, and the extraction."""
     from traps_pipeline.mechanism.stages import examined_model
 
     extraction = Extraction.parse(key)
@@ -71,7 +71,7 @@ def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
 
 
 def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
-    """The model of an extraction, and its stored states."""
+    """Return the model of an extraction, and its stored states."""
     from traps_pipeline.mechanism.stored import StoredStates
 
     model, extraction = _model(workspace, key)
@@ -79,7 +79,7 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
 
 
 def _make_baselines(workspace: Workspace, key: str) -> StageOutput:
-    """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
+    """Return the probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
     from traps_pipeline.mechanism.baselines import baseline_rows
 
     return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
@@ -104,24 +104,24 @@ probe_baselines = stage(
 
 
 def _make_gate(workspace: Workspace, key: str) -> StageOutput:
-    """The model's figures before and after a probe on its states has turned answers into abstentions, beside gates on
-    raw inputs, on the output margin and with shuffled labels."""
+    """Return the model's figures before and after a probe on its states has turned answers into abstentions, beside
+    gates on raw inputs, on the output margin and with shuffled labels."""
     from traps_pipeline.mechanism.gating import gate_rows
 
     return StageOutput(gate_rows(workspace, *_examined(workspace, key)))
 
 
 def _make_curves(workspace: Workspace, key: str) -> StageOutput:
-    """Risk against coverage as gates give up answers, over the four datasets."""
+    """Return risk against coverage as gates give up answers, over the four datasets."""
     from traps_pipeline.mechanism.gating import curve_rows
 
     return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
 
 
-def _gated(wanted: StudyPartitions, key: str) -> bool:
-    """Whether the model of an extraction is asked, so that there are answers to gate."""
+def _gated(partitions: StudyPartitions, key: str) -> bool:
+    """Return whether the model of an extraction is asked, so that there are answers to gate."""
     extraction = Extraction.parse(key)
-    asked = {(e.model, e.regime) for e in wanted.evaluations}
+    asked = {(e.model, e.regime) for e in partitions.evaluations}
     return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in asked for r in PROMPTING)
 
 
@@ -147,7 +147,7 @@ risk_coverage = _stage_of_gates(RISK_COVERAGE, _make_curves)
 
 
 def _make_lens(workspace: Workspace, key: str) -> StageOutput:
-    """The output margin of stored states at every layer, through the model's final norm and head."""
+    """Return the output margin of stored states at every layer, through the model's final norm and head."""
     from traps_pipeline.mechanism.lens import lens_rows
 
     return StageOutput(lens_rows(workspace, *_examined(workspace, key)))
@@ -164,7 +164,9 @@ lens = stage(
 
 
 def _make_item_scores(workspace: Workspace, key: str) -> StageOutput:
-    """What states and output say of each item, by probes that have not seen its scenario, beside its verdicts."""
+    """Return what states and output say of each item, by probes that have not seen its scenario, beside its
+    verdicts.
+    """
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
@@ -187,16 +189,16 @@ item_scores = stage(
 
 
 def _make_sentences(workspace: Workspace, key: str) -> StageOutput:
-    """How likely whole abstentions are to a model behind every item, beside its own answers."""
+    """Return how likely whole abstentions are to a model behind every item, beside its own answers."""
     from traps_pipeline.mechanism.sentences import sentence_rows
 
     return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
 
 
-def _read_in_sentences(wanted: StudyPartitions, key: str) -> bool:
+def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
     extraction = Extraction.parse(key)
-    asked = {(e.model, e.regime) for e in wanted.evaluations}
-    return wanted.reads_sentences and (extraction.model, extraction.prompt) in asked
+    asked = {(e.model, e.regime) for e in partitions.evaluations}
+    return partitions.reads_sentences and (extraction.model, extraction.prompt) in asked
 
 
 sentences = stage(
@@ -211,7 +213,9 @@ sentences = stage(
 
 
 def _make_patching(workspace: Workspace, key: str) -> StageOutput:
-    """Indirect effects of groups of positions between matched controls and voids, at every layer, beside nulls."""
+    """Return indirect effects of groups of positions between matched controls and voids, at every layer, beside
+    nulls.
+    """
     from traps_pipeline.mechanism.patched import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
@@ -230,14 +234,14 @@ patching = stage(
 
 
 def _make_nulls(workspace: Workspace, _: None) -> StageOutput:
-    """The effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
+    """Return the effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
     from traps_pipeline.mechanism.nulls import null_rows
 
     return made_of("nulls", STEERING_NULLS, null_rows(workspace.tables.read(STEERING_EFFECTS, {})))
 
 
 def _make_steering_pecs(workspace: Workspace, _: None) -> StageOutput:
-    """PECS of the steered model under each sign policy, with the share of degenerate answers."""
+    """Return PECS of the steered model under each sign policy, with the share of degenerate answers."""
     from traps_pipeline.mechanism.nulls import pecs_rows
 
     return made_of("pecs", STEERING_PECS, pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})))

@@ -51,7 +51,7 @@ def _panel(workspace: Workspace) -> list[str]:
 
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
-    """The votes of the study's panel as it is now. Raises TrapsError if there is none."""
+    """Return the votes of the study's panel as it is now. Raises TrapsError if there is none."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.models.judges import panel_id
     from traps_pipeline.protocol.ratings import VOTE_COLUMNS
@@ -64,7 +64,7 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
 
 
 def _make_agreement(workspace: Workspace, _: None) -> StageOutput:
-    """Agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
+    """Return agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
     Krippendorff."""
     from traps_pipeline.judging.agreement import agreement
 
@@ -72,14 +72,14 @@ def _make_agreement(workspace: Workspace, _: None) -> StageOutput:
 
 
 def _make_judge_bias(workspace: Workspace, _: None) -> StageOutput:
-    """Each judge's rate of yes against the panel's majority, per dataset and task."""
+    """Return each judge's rate of yes against the panel's majority, per dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias
 
     return made_of("judge bias", JUDGE_BIAS, judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
 
 
 def _make_leave_one_out(workspace: Workspace, _: None) -> StageOutput:
-    """PECS by the votes of two judges, for each judge that is left out."""
+    """Return PECS by the votes of two judges, for each judge that is left out."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.leave_one_out import leave_one_out
 
@@ -90,21 +90,21 @@ def _make_leave_one_out(workspace: Workspace, _: None) -> StageOutput:
 
 
 def _make_confabulation(workspace: Workspace, _: None) -> StageOutput:
-    """Void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no such
-    judge."""
+    """Return void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no
+    such judge."""
     from traps_pipeline.judging.confabulation import collect_labels
 
     return collect_labels(workspace)
 
 
-def _many_invalid(workspace: Workspace, key: str | None, made: StageOutput) -> str:
-    labels = made.rows(CONFABULATION)
+def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
+    labels = output.rows(CONFABULATION)
     invalid = sum(not label.valid for label in labels)
     return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
 
 
 def _make_prevalence(workspace: Workspace, _: None) -> StageOutput:
-    """How often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
+    """Return how often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
     from traps_pipeline.scoring.prevalence import prevalence
 
     return made_of("prevalence", CONFABULATION_PREVALENCE, prevalence(workspace.tables.read(CONFABULATION, {})))

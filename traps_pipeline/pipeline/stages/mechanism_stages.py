@@ -88,14 +88,14 @@ def _probed_from(dataset: str) -> list[str]:
     return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
 
 
-def steers(wanted: StudyPartitions, key: str | None) -> bool:
-    """Whether the study steers models."""
-    return wanted.steers
+def steers(partitions: StudyPartitions, key: str | None) -> bool:
+    """Return whether the study steers models."""
+    return partitions.steers
 
 
 def _make_probe_items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with a
-    question that they answer, and chaotic's clips with the frame times of the other side."""
+    """Return clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with
+    a question that they answer, and chaotic's clips with the frame times of the other side."""
     from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
     return StageOutput(rows_of(workspace, dataset))
@@ -116,17 +116,19 @@ probe_items = stage(
 
 
 def _make_hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Hidden states of a frozen local model at every layer, one row per item; only missing states are extracted."""
+    """Return hidden states of a frozen local model at every layer, one row per item; only missing states are
+    extracted.
+    """
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
     return StageOutput(rows, Tally(asked=new), {"extracted": new})
 
 
-def _unsound_layers(workspace: Workspace, key: str | None, made: StageOutput) -> list[int]:
+def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) -> list[int]:
     from traps_pipeline.mechanism.stages import unsound_layers
 
-    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows(HIDDEN_STATES)[0].n_layers)
+    return unsound_layers(workspace, StatesCell.parse(str(key)), output.rows(HIDDEN_STATES)[0].n_layers)
 
 
 hidden_states = stage(
@@ -146,18 +148,19 @@ hidden_states = stage(
 
 
 def _make_probes(workspace: Workspace, key: str) -> StageOutput:
-    """Probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
+    """Return probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled,
+    centroids."""
     from traps_pipeline.mechanism.stages import probe_rows
 
     return StageOutput(probe_rows(workspace, Extraction.parse(key)))
 
 
-def _outside_shares(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     def is_wrong(row: ProbeRow) -> bool:
         figures = (row.value, row.low, row.high)
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
-    wrong = sum(is_wrong(row) for row in made.rows(PROBES))
+    wrong = sum(is_wrong(row) for row in output.rows(PROBES))
     return f"{wrong} rows are wrong" if wrong else ""
 
 
@@ -180,7 +183,7 @@ probes = stage(
 
 
 def _make_directions(workspace: Workspace, key: str) -> StageOutput:
-    """The void direction of every dataset at every layer, with draws of its nulls, as files."""
+    """Return the void direction of every dataset at every layer, with draws of its nulls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
 
     return StageOutput(direction_rows(workspace, Extraction.parse(key)))
@@ -201,7 +204,7 @@ directions = stage(
 
 
 def _make_cosines(workspace: Workspace, _: None) -> StageOutput:
-    """Cosines of every two void directions of a model at one layer, with their reliability."""
+    """Return cosines of every two void directions of a model at one layer, with their reliability."""
     from traps_pipeline.mechanism.cosines import cosine_rows
 
     return made_of("cosines", COSINES, cosine_rows(workspace))
@@ -218,7 +221,8 @@ cosines = stage(
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Answers of a model that is steered along every path into a dataset; answers in the ledger are not asked again."""
+    """Yield answers of a model that is steered along every path into a dataset; answers in the ledger are not asked
+    again."""
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
@@ -226,8 +230,8 @@ def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tup
         cell = SteeringCell.parse(key)
         entry = examined_model(workspace, cell.evaluation.model)
         along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
-        for done, made in collect_steered(workspace, entry, [cell], along):
-            yield done.key, made
+        for done, output in collect_steered(workspace, entry, [cell], along):
+            yield done.key, output
 
 
 steering = stage(
@@ -247,11 +251,13 @@ steering = stage(
 
 
 def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """The votes of the study's panel on whether each steered answer abstains, and whether a control's is correct."""
+    """Yield the votes of the study's panel on whether each steered answer abstains, and whether a control's is
+    correct.
+    """
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
-    for done, made in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
-        yield done.key, made
+    for done, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield done.key, output
 
 
 steering_votes = stage(
@@ -266,7 +272,7 @@ steering_votes = stage(
 
 
 def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """The steered answers, and the votes on them."""
+    """Return the steered answers, and the votes on them."""
     from traps_pipeline.mechanism.shares import VOTE_COLUMNS
 
     return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)

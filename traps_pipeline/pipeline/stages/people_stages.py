@@ -43,29 +43,30 @@ annotation_protocol = source(
 
 
 def _make_labels(workspace: Workspace, _: None) -> StageOutput:
-    """People's labels of clips and answers that the study has, each with its item and what the panel decided; empty
-    until somebody has labelled."""
+    """Return people's labels of clips and answers that the study has, each with its item and what the panel decided;
+    empty until somebody has labelled."""
     from traps_pipeline.people.labels import human_labels
 
     return StageOutput(human_labels(workspace))
 
 
 def _make_agreement(workspace: Workspace, _: None) -> StageOutput:
-    """How far people agree, by task and decision."""
+    """Return how far people agree, by task and decision."""
     from traps_pipeline.people.labels import human_agreement
 
     return made_of("agreement of people", HUMAN_AGREEMENT, human_agreement(workspace.tables.read(HUMAN_LABELS, {})))
 
 
 def _make_row(workspace: Workspace, _: None) -> StageOutput:
-    """Acc, AbsRec, FalseAbs and PECS of people with intervals, their agreement, and the seconds that a clip takes."""
+    """Return Acc, AbsRec, FalseAbs and PECS of people with intervals, their agreement, and the seconds that a clip
+    takes."""
     from traps_pipeline.people.human_scores import human_row
 
     return made_of("people", HUMAN_ROW, human_row(workspace.tables.read(HUMAN_LABELS, {})))
 
 
 def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """All HUMAN_LABELS rows, and the VERDICTS rows of the study's panel."""
+    """Return all HUMAN_LABELS rows, and the VERDICTS rows of the study's panel."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.models.judges import panel_id
 
@@ -76,14 +77,14 @@ def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFr
 
 
 def _make_errors(workspace: Workspace, _: None) -> StageOutput:
-    """Sensitivity and specificity of the panel against people, by task; empty while it is not validated."""
+    """Return sensitivity and specificity of the panel against people, by task; empty while it is not validated."""
     from traps_pipeline.people.corrected_scores import panel_errors
 
     return made_of("the panel against people", PANEL_ERRORS, panel_errors(*_labels_and_verdicts(workspace)))
 
 
 def _make_corrected(workspace: Workspace, _: None) -> StageOutput:
-    """Every entry of the leaderboard as judged, and corrected for the panel's errors."""
+    """Return every entry of the leaderboard as judged, and corrected for the panel's errors."""
     from traps_pipeline.people.corrected_scores import corrected
 
     return made_of("judged and corrected", CORRECTED, corrected(*_labels_and_verdicts(workspace)))

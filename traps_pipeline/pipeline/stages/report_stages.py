@@ -35,8 +35,8 @@ published = source(
 
 
 def _report_page(workspace: Workspace, _: None) -> StageOutput:
-    """Findings, leaderboard, figures and tables beside the paper's on one page that opens from disk; every number is a
-    link into the explorer. A table or figure is made again only when a table that it reads changed."""
+    """Return findings, leaderboard, figures and tables beside the paper's on one page that opens from disk; every
+    number is a link into the explorer. A table or figure is made again only when a table that it reads changed."""
     from traps_pipeline.report.cards import Card, Sources
     from traps_pipeline.report.publish import MARKDOWN, report_files, report_parts
 
@@ -55,7 +55,7 @@ def _report_page(workspace: Workspace, _: None) -> StageOutput:
 
 
 def _site(workspace: Workspace, _: None) -> StageOutput:
-    """The explorer: all answers with their votes and clips, on pages that open from disk."""
+    """Return the explorer: all answers with their votes and clips, on pages that open from disk."""
     from traps_pipeline.report.explorer.site import site_files
 
     files = site_files(workspace)

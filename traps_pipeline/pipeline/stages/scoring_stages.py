@@ -23,7 +23,7 @@ GROUP = "scoring"
 
 
 def _make_metrics(workspace: Workspace, dataset: str) -> StageOutput:
-    """Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
+    """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.metrics import cell_metrics
 
@@ -33,10 +33,10 @@ def _make_metrics(workspace: Workspace, dataset: str) -> StageOutput:
     return StageOutput(cell_metrics(judged))
 
 
-def _wrong_figures(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _wrong_figures(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     from traps_pipeline.scoring.metrics import wrong_figures
 
-    wrong = wrong_figures(made.frame)
+    wrong = wrong_figures(output.frame)
     return f"{wrong} figures are wrong" if wrong else ""
 
 
@@ -57,7 +57,7 @@ metrics = stage(
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """All METRICS rows of the pairs, and the VERDICTS rows from which they are made, without arms."""
+    """Return all METRICS rows of the pairs, and the VERDICTS rows from which they are made, without arms."""
     from traps_pipeline.judging.verdicts import current
 
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
@@ -67,7 +67,7 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
 
 
 def _make_contrasts(workspace: Workspace, _: None) -> StageOutput:
-    """Paired differences between models and between regimes, with intervals and Holm's correction."""
+    """Return paired differences between models and between regimes, with intervals and Holm's correction."""
     from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
@@ -75,19 +75,21 @@ def _make_contrasts(workspace: Workspace, _: None) -> StageOutput:
     table = paired(resample(judged), cells, judged)
     separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
-    shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
-    return StageOutput(table, shown=shown)
+    figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
+    return StageOutput(table, shown=figures)
 
 
 def _make_regime_tests(workspace: Workspace, _: None) -> StageOutput:
-    """McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
+    """Return McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
     return made_of("regime tests", REGIME_TESTS, mcnemar(_scored(workspace, "regime_tests")[1]))
 
 
 def _make_leaderboard(workspace: Workspace, _: None) -> StageOutput:
-    """Every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals, ranks."""
+    """Return every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals,
+    ranks.
+    """
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
     from traps_pipeline.scoring.standings import leaderboard as rank
@@ -99,16 +101,16 @@ def _make_leaderboard(workspace: Workspace, _: None) -> StageOutput:
     return StageOutput(board, shown={"leaderboard": Markdown(leaderboard_markdown(board))} | best)
 
 
-def _wrong_intervals(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _wrong_intervals(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     from traps_pipeline.scoring.standings import wrong_intervals
 
-    wrong = wrong_intervals(made.frame)
+    wrong = wrong_intervals(output.frame)
     return f"{wrong} intervals are wrong" if wrong else ""
 
 
 def _make_robust(workspace: Workspace, _: None) -> StageOutput:
-    """Conjunction, robust figure and inference of every model and regime with all four datasets and an arm; empty if no
-    arm was run."""
+    """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm;
+    empty if no arm was run."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.robust import robust as without_shortcuts
 
@@ -118,10 +120,10 @@ def _make_robust(workspace: Workspace, _: None) -> StageOutput:
     return made_of("conjunction", ROBUST, without_shortcuts(judged))
 
 
-def _wrong_robust(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _wrong_robust(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     from traps_pipeline.scoring.robust import wrong_rows
 
-    wrong = wrong_rows(made.frame)
+    wrong = wrong_rows(output.frame)
     return f"{wrong} rows are wrong" if wrong else ""
 
 
@@ -139,10 +141,10 @@ def _make_hypotheses(workspace: Workspace, _: None) -> StageOutput:
     return made_of("doses", HYPOTHESES, by_dose(judged, offered))
 
 
-def _wrong_doses(workspace: Workspace, key: str | None, made: StageOutput) -> str:
+def _wrong_doses(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     from traps_pipeline.scoring.doses import wrong_rows
 
-    wrong = wrong_rows(made.frame)
+    wrong = wrong_rows(output.frame)
     return f"{wrong} rows are wrong" if wrong else ""
 
 

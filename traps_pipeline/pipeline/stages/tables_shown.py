@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 
 def made_of(name: str, table: Table, rows: "pd.DataFrame | Sequence[Any]") -> StageOutput:
-    """A table without partitions, from a frame or from values of its dataclass, with its first rows under a name."""
+    """Return a table without partitions, from a frame or from values of its dataclass, with its first rows under a
+    name."""
     import pandas as pd
 
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), columns=pd.Index(table.names))
@@ -21,7 +22,7 @@ def made_of(name: str, table: Table, rows: "pd.DataFrame | Sequence[Any]") -> St
 
 
 def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> Markdown | str:
-    """The first rows as a Markdown table. Use it only for figures and ids, never for text that a model wrote."""
+    """Return the first rows as a Markdown table. Use it only for figures and ids, never for text that a model wrote."""
     if frame.empty:
         return "not run"
     head = frame.head(rows)

@@ -13,24 +13,26 @@ ITEMS, ABOUT, MEDIA = "items.jsonl", "about.json", "media"
 
 @cache
 def about() -> dict[str, Any]:
-    """Name, version and canary of the benchmark, prompts by regime, and the parameters that the protocol sends."""
+    """Return name, version and canary of the benchmark, prompts by regime, and the parameters that the protocol
+    sends.
+    """
     return json.loads((FOLDER / ABOUT).read_text(encoding="utf-8"))
 
 
 @cache
 def items() -> list[dict[str, Any]]:
-    """Every item: question, labels, truth, and the paths of what is shown of its clip, in order."""
+    """Return every item: question, labels, truth, and the paths of what is shown of its clip, in order."""
     lines = (FOLDER / ITEMS).read_text(encoding="utf-8").split("\n")
     return [json.loads(line) for line in lines if line]
 
 
 def media_of(item: dict[str, Any]) -> list[Path]:
-    """What a model is shown: the mp4, or the JPEGs in order."""
+    """Return what a model is shown: the mp4, or the JPEGs in order."""
     return [FOLDER / name for name in item["media"]]
 
 
 def prompt(regime: str) -> str:
-    """The system prompt. Raises ValueError with the known regimes."""
+    """Return the system prompt. Raises ValueError with the known regimes."""
     prompts: dict[str, str] = about()["prompts"]
     if regime not in prompts:
         raise ValueError(f"regime {regime!r} is unknown; known: {', '.join(prompts)}")

@@ -26,12 +26,14 @@ _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_fi
 
 @task
 def traps(regime: str = "standard") -> Any:
-    """The task of the installed package: `inspect eval traps_harness/traps`."""
+    """Return the task of the installed package: `inspect eval traps_harness/traps`."""
     return evaluation(regime)
 
 
 def evaluation(regime: str) -> Any:
-    """All items under one regime, once: a further run is a further evaluation, so that PECS is computed per run."""
+    """Return all items under one regime, once: a further run is a further evaluation, so that PECS is computed per
+    run.
+    """
     system = prompt(regime)
     samples = [
         Sample(
@@ -66,18 +68,18 @@ def _text(item: dict[str, Any]) -> Any:
 
 @metric
 def traps_figures() -> Any:
-    """PECS and what it is made of, overall and by dataset."""
+    """Return PECS and what it is made of, overall and by dataset."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        found = figures(Judged.of(one.score.metadata) for one in scores)
-        return {name: value for name, value in found.items() if value is not None}
+        results = figures(Judged.of(one.score.metadata) for one in scores)
+        return {name: value for name, value in results.items() if value is not None}
 
     return compute
 
 
 @scorer(metrics=[traps_figures()])
 def panel(regime: str) -> Any:
-    """The panel of rules: 1 for a control answered correctly and for a void abstained on."""
+    """Return the panel of rules: 1 for a control answered correctly and for a void abstained on."""
     known = {item["item_id"]: item for item in items()}
 
     async def score(state: Any, target: Any) -> Any:

@@ -16,7 +16,7 @@ from traps_pipeline.release.harness.scoring import Judged, figures, judge
 
 
 def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
-    """The clip's path, or its frames in order."""
+    """Return the clip's path, or its frames in order."""
     from PIL import Image
 
     paths = media_of(doc)
@@ -26,7 +26,7 @@ def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
 
 
 def doc_to_target(doc: dict[str, Any]) -> str:
-    """The right answer; nothing on a void."""
+    """Return the right answer; nothing on a void."""
     return doc["ground_truth"] or ""
 
 
@@ -37,9 +37,9 @@ def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime:
 
 def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> list[dict[str, Any]]:
     """For chat models: system prompt, then the clip and the question, nothing else."""
-    shown = doc_to_visual(doc)
-    kind = "video" if isinstance(shown[0], str) else "image"
-    content = [{"type": kind, "url": one} for one in shown]
+    visuals = doc_to_visual(doc)
+    kind = "video" if isinstance(visuals[0], str) else "image"
+    content = [{"type": kind, "url": one} for one in visuals]
     return [
         {"role": "system", "content": [{"type": "text", "text": prompt(regime)}]},
         {"role": "user", "content": [*content, {"type": "text", "text": doc["question"]}]},
@@ -47,7 +47,7 @@ def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, reg
 
 
 def _results(doc: dict[str, Any], results: list[str], *, regime: str) -> dict[str, Any]:
-    """The panel's decision about the answer, under the name of each figure."""
+    """Return the panel's decision about the answer, under the name of each figure."""
     judged = {**vars(judge(doc, "answer", results[0], regime)), "regime": regime}
     return dict.fromkeys((f"traps_{name}" for name in NAMES), judged)
 

@@ -40,12 +40,12 @@ class Judged:
 
     @staticmethod
     def of(record: Mapping[str, Any]) -> Judged:
-        """Inverse of `vars`."""
+        """Return inverse of `vars`."""
         return Judged(**{name: record[name] for name in Judged.__dataclass_fields__})
 
 
 def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> Judged:
-    """The panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
+    """Return the panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
 
     The three seats of the panel `rules` read by the same rules, so that one reading is their majority.
     """
@@ -66,22 +66,22 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
 
 
 def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
-    """Acc, AbsRec, FalseAbs, J and PECS of one run: `DATASET_FIGURE` of each dataset, and FIGURE overall, the
+    """Return Acc, AbsRec, FalseAbs, J and PECS of one run: `DATASET_FIGURE` of each dataset, and FIGURE overall, the
     equal-weight mean over the four datasets, None unless all four are there; `missing`, items without a decision, and
     `unread`, those of them whose text the rules could not read.
     """
     rows = list(judged)
-    found: dict[str, float | None] = {}
+    results: dict[str, float | None] = {}
     by_dataset = {name: _of_dataset([row for row in rows if row.dataset == name]) for name in DATASETS}
     for name, own in by_dataset.items():
         if any(row.dataset == name for row in rows):
-            found |= {f"{name}_{figure}": own[figure] for figure in FIGURES}
+            results |= {f"{name}_{figure}": own[figure] for figure in FIGURES}
     for figure in FIGURES:
         values = [own[figure] for own in by_dataset.values()]
-        whole = [value for value in values if value is not None]
-        found[figure] = sum(whole) / len(DATASETS) if len(whole) == len(DATASETS) else None
+        decided = [value for value in values if value is not None]
+        results[figure] = sum(decided) / len(DATASETS) if len(decided) == len(DATASETS) else None
     undecided = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
-    return found | {
+    return results | {
         "missing": float(len(undecided)),
         "unread": float(sum(row.outcome == UNREAD for row in rows)),
     }

@@ -43,7 +43,8 @@ SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
 
 
 def shown(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
-    """What a harness shows of a clip: the protocol's 25 frames, or evenly spaced ones as an entry's `media` has them.
+    """Return what a harness shows of a clip: the protocol's 25 frames, or evenly spaced ones as an entry's `media` has
+    them.
 
     Raises TrapsError for a video of evenly spaced frames, which would play at no constant rate.
     """
@@ -90,26 +91,26 @@ def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"
 
 
 def copied(source: str) -> str:
-    """The source of a module of this package as one of the harness's: its imports name its neighbours there."""
+    """Return the source of a module of this package as one of the harness's: its imports name its neighbours there."""
     return _IMPORT.sub(lambda m: f"{m[1]}from {PACKAGE}.{m[2].rpartition('.')[2]} import ", source)
 
 
 def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
     """Write items and what is shown of their clips; returns the digests of the items."""
-    store, made, lines, hashes = MediaStore(package / ".prepared"), dict[str, list[str]](), list[str](), list[str]()
+    store, prepared, lines, hashes = MediaStore(package / ".prepared"), dict[str, list[str]](), list[str](), list[str]()
     for _, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row: dict[str, Any] = json.loads(line)
         if row["dataset"] not in DATASETS:
             continue
         clip = row["media_digest"]
-        if clip not in made:
+        if clip not in prepared:
             sent = store.prepare(release / CLIPS / row["file_name"], clip, media)
-            made[clip] = []
+            prepared[clip] = []
             for number, part in enumerate(payload(sent)):
                 name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media.profile == "images" else ".mp4")
                 write_bytes(package / name, part)
-                made[clip].append(name)
-        item = {name: row[name] for name in _SHOWN} | {"media": made[clip]}
+                prepared[clip].append(name)
+        item = {name: row[name] for name in _SHOWN} | {"media": prepared[clip]}
         lines.append(json.dumps(item, ensure_ascii=False) + "\n")
         hashes.append(row["item_hash"])
     write_text(package / ITEMS, "".join(lines))

@@ -62,7 +62,7 @@ class StudyAnswers:
     votes: pa.Table
 
     def shards(self) -> Iterator[Shard]:
-        """The shards, in order; no pair is divided."""
+        """Yield the shards, in order; no pair is divided."""
         item_of = self.decisions["item"].to_numpy()
         pairs = self.items["pair_id"].to_numpy()
         begins = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
@@ -80,8 +80,8 @@ class StudyAnswers:
 
 
 def study_items(workspace: Workspace) -> pd.DataFrame:
-    """ITEMS rows with the column `family`: datasets in the benchmark's order, then by family, scenario and side. Raises
-    TrapsError where there are none."""
+    """Return ITEMS rows with the column `family`: datasets in the benchmark's order, then by family, scenario and side.
+    Raises TrapsError where there are none."""
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
@@ -95,8 +95,8 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 
 
 def study_answers(workspace: Workspace) -> StudyAnswers:
-    """All answers to items that are still in the benchmark, with their decisions and votes. Raises TrapsError where the
-    study has no items."""
+    """Return all answers to items that are still in the benchmark, with their decisions and votes. Raises TrapsError
+    where the study has no items."""
     items = study_items(workspace)
     responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)
@@ -139,7 +139,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
 
 
 def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
-    """Rows of a table whose item is in `items`, with the place of the item as the column `item`."""
+    """Return rows of a table whose item is in `items`, with the place of the item as the column `item`."""
     rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
     place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
     rows = rows.drop_columns("item_id").append_column("item", place)
@@ -147,15 +147,15 @@ def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items:
 
 
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
-    """Those that gave answers, by model, regime (in the benchmark's order) and run."""
+    """Return those that gave answers, by model, regime (in the benchmark's order) and run."""
     distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
     found = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
     return sorted(found, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
-    """The rows with `key`: their item's place times the number of evaluations, plus their evaluation's place. Rows of
-    an evaluation without answers are left out."""
+    """Return the rows with `key`: their item's place times the number of evaluations, plus their evaluation's place.
+    Rows of an evaluation without answers are left out."""
     place = {(e.model, e.regime, e.run): k for k, e in enumerate(evaluations)}
     columns = [rows[name].combine_chunks().dictionary_encode() for name in _EVALUATION]
     sizes = [len(column.dictionary) for column in columns]
@@ -179,12 +179,12 @@ def _sorted(rows: pa.Table) -> pa.Table:
 
 
 def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
-    """The distinct values of a column, sorted, and each row's place among them."""
+    """Return the distinct values of a column, sorted, and each row's place among them."""
     values = sorted(column.unique().to_pylist())
     return values, pc.index_in(column, value_set=pa.array(values, pa.string())).to_numpy()
 
 
 def _decision(column: pa.ChunkedArray, rows: np.ndarray) -> np.ndarray:
-    """The column at these rows as NO, YES or NONE; NONE where the row is -1."""
+    """Return the column at these rows as NO, YES or NONE; NONE where the row is -1."""
     filled = pc.fill_null(column.cast(pa.int8()), NONE)
     return np.append(filled.to_numpy(), NONE)[rows]

@@ -19,7 +19,7 @@ _PAGE_BYTES = 1 << 24  # a column of a shard is one page, since what repeats in 
 
 
 def parquet_text(table: pa.Table, level: int = 9) -> str:
-    """A table as a Parquet file (zstd) in base64."""
+    """Return a table as a Parquet file (zstd) in base64."""
     stream = io.BytesIO()
     pq.write_table(
         table.replace_schema_metadata(None), stream, compression="zstd", compression_level=level,
@@ -30,7 +30,7 @@ def parquet_text(table: pa.Table, level: int = 9) -> str:
 
 
 def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
-    """The script of one data file. content: JSON values; Parquet files are `parquet_text`."""
+    """Return the script of one data file. content: JSON values; Parquet files are `parquet_text`."""
     # "<" cannot close a script element, should a host inline the file; JSON knows the escape.
     body = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return f"TRAPS_DATA({json.dumps(name)},{json.dumps(version)},{body});\n".encode()

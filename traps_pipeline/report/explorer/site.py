@@ -110,7 +110,8 @@ def _files(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str], clips_at: str, *,
     report: bool,
 ) -> dict[str, bytes]:  # fmt: skip
-    """The files by path, the index last. clips: those that can be played; clips_at: the folder that holds `clips`."""
+    """Return the files by path, the index last. clips: those that can be played; clips_at: the folder that holds
+    `clips`."""
     contents = _contents(workspace, answers, scenarios, clips)
     stamp = _digest(contents)
     files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
@@ -118,7 +119,7 @@ def _files(
 
 
 def _former_files(folder: Path) -> set[str]:
-    """The files of an earlier site in the folder. Raises TrapsError where the folder holds something else."""
+    """Return the files of an earlier site in the folder. Raises TrapsError where the folder holds something else."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return set()
     try:
@@ -131,7 +132,7 @@ def _former_files(folder: Path) -> set[str]:
 
 
 def _is_inside(name: str) -> bool:
-    """Whether a relative path stays in its folder."""
+    """Return whether a relative path stays in its folder."""
     parts = Path(name).parts
     return bool(parts) and not Path(name).is_absolute() and ".." not in parts
 
@@ -155,7 +156,7 @@ def _put_clip(source: Path, target: Path) -> int:
 def _contents(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str]
 ) -> dict[str, dict[str, Any]]:
-    """Every data file by name: JSON values, and Parquet files under the name of their table."""
+    """Return every data file by name: JSON values, and Parquet files under the name of their table."""
     import pyarrow as pa
 
     contents: dict[str, dict[str, Any]] = {}
@@ -176,7 +177,7 @@ def _contents(
 
 
 def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_clips: bool) -> dict[str, Any]:
-    """What every page of the explorer needs, and the leaderboard."""
+    """Return what every page of the explorer needs, and the leaderboard."""
     from traps_pipeline.models.registry import load_models
 
     board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
@@ -214,18 +215,18 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
 
 
 def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows as JSON values; a missing value is null."""
+    """Return the rows as JSON values; a missing value is null."""
     rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
     return [{str(name): _plain(value) for name, value in row.items()} for row in rows]
 
 
 def _plain(value: Any) -> Any:
-    """A value of a frame as JSON has it."""
+    """Return a value of a frame as JSON has it."""
     return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
-    """What the page of a pair says about its scenario, by scenario."""
+    """Return what the page of a pair says about its scenario, by scenario."""
     specs, videos = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
     clips = {(row["scenario_id"], row["side"]): row for row in _records(videos)}
     rows = []
@@ -251,18 +252,20 @@ BOARD_COMES_S = 0.6  # so long a board is seen on its way at most
 
 
 def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None:
-    """The last moment before the board comes into the picture that closes a control; null where none does."""
+    """Return the last moment before the board comes into the picture that closes a control; null where none does."""
     return None if closes is None or clip is None else (closes - 0.5) / clip["fps"] - BOARD_COMES_S
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The clips that the pages show, as the tables name them. A name that leads out of the folder is left out."""
+    """Return the clips that the pages show, as the tables name them. A name that leads out of the folder is left
+    out.
+    """
     named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
     return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
 
 
 def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
-    """The version of a site: a digest of all its data and of its script."""
+    """Return the version of a site: a digest of all its data and of its script."""
     found = hashlib.sha256(script().encode())
     for name, content in contents.items():
         for key, value in content.items():
@@ -276,7 +279,8 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """The one script: the bundled libraries with their licences, then our sources, which share one function's scope.
+    """Return the one script: the bundled libraries with their licences, then our sources, which share one function's
+    scope.
 
     Raises TrapsError where the bundle is not the one that was checked in.
     """
@@ -289,7 +293,7 @@ def script() -> str:
 
 
 def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: bool = False) -> str:
-    """The page that opens the explorer. It may load scripts and clips of its own folder, and nothing else."""
+    """Return the page that opens the explorer. It may load scripts and clips of its own folder, and nothing else."""
     import jinja2
 
     style = (WEB / "style.css").read_text(encoding="utf-8")

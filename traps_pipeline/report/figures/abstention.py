@@ -32,8 +32,8 @@ PERCENT = (0, 25, 50, 75, 100)
 
 
 def visual_textual(results: Results) -> Figure:
-    """AbsRec on visual (x) against textual voids (y), one point per model, averaged over the taxonomies that it was
-    asked; a second panel has the means by family."""
+    """Return AbsRec on visual (x) against textual voids (y), one point per model, averaged over the taxonomies that it
+    was asked; a second panel has the means by family."""
     rates = results.rates
     if not len(rates):
         raise NotRun(results.why("rates"))
@@ -62,9 +62,11 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
-    """Whether a row has both rates of its model pooled over taxonomies, or those of the one that it was asked."""
-    whole = rates.loc[rates["taxonomy"] == "pooled", "model"]
-    return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(whole)
+    """Return whether a row has both rates of its model pooled over taxonomies, or those of the one that it was
+    asked.
+    """
+    models = rates.loc[rates["taxonomy"] == "pooled", "model"]
+    return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
 
 
 def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
@@ -96,8 +98,8 @@ def _draw_models_key(figure: Figure, models: list[str]) -> None:
 
 
 def abs_rec_by_model(results: Results) -> Figure:
-    """AbsRec of every model under standard (hollow) and guided (filled) with equal weights of datasets; bars are the
-    deviation over runs."""
+    """Return AbsRec of every model under standard (hollow) and guided (filled) with equal weights of datasets; bars are
+    the deviation over runs."""
     overall = results.overall
     rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
     if not len(rows):
@@ -141,8 +143,9 @@ def _abs_rec(sides: dict[tuple[str, str], Any], model: str, regime: str) -> floa
 
 
 def doubt(results: Results) -> Figure:
-    """Doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot for each dataset, and a
-    large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title says why."""
+    """Return doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot for each dataset,
+    and a large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title says
+    why."""
     points, refused = doubt_points(results)
     if not len(points):
         raise NotRun(refused or _no_doubt(results))
@@ -173,8 +176,8 @@ def _no_doubt(results: Results) -> str:
 
 
 def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
-    """The columns thinking, other, dataset, doubt, gain (fractions), one row per pair and dataset; and the reasons why
-    pairs were refused.
+    """Return the columns thinking, other, dataset, doubt, gain (fractions), one row per pair and dataset; and the
+    reasons why pairs were refused.
 
     AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (docs/spec.md 9.2).
     """

@@ -41,10 +41,11 @@ GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 
 
 def probe_baselines(results: Results) -> Figure:
-    """AUROC of each dataset's probe on itself and on the other datasets (black, with its interval) beside probes on raw
-    inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations. oc and ch are
-    occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch; † is from
-    fewer than ten items a side. A probe shows what the states add only as far as it is above all coloured marks."""
+    """Return AUROC of each dataset's probe on itself and on the other datasets (black, with its interval) beside probes
+    on raw inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations. oc and
+    ch are occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch; † is
+    from fewer than ten items a side. A probe shows what the states add only as far as it is above all coloured marks.
+    """
     rows = beside(results)
     if not len(rows):
         raise NotRun(why(results))
@@ -71,10 +72,10 @@ def probe_baselines(results: Results) -> Figure:
 
 def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
     order = [(s, t) for s in DATASETS for t in sorted(DATASETS, key=lambda t: (t != s, DATASETS.index(t)))]
-    found = {(row["source"], row["target"]): row for row in rows.to_dict("records")}
-    shown = [pair for pair in order if pair in found]
+    by_pair = {(row["source"], row["target"]): row for row in rows.to_dict("records")}
+    shown = [pair for pair in order if pair in by_pair]
     for x, pair in enumerate(shown):
-        row = found[pair]
+        row = by_pair[pair]
         if row["noise_spread"] == row["noise_spread"]:
             low, high = row["noise"] - 2 * row["noise_spread"], row["noise"] + 2 * row["noise_spread"]
             ax.plot([x, x], [max(low, 0), min(high, 1)], color=GRID, linewidth=7, solid_capstyle="butt", zorder=1)
@@ -85,15 +86,15 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
     names = ["itself" if s == t else f"{SHORT[s]}→{SHORT[t]}" for s, t in shown]
     names = [SHORT[s] if s == t else n for n, (s, t) in zip(names, shown, strict=True)]
-    marked = [f"{name} {found[pair]['mark']}".strip() for name, pair in zip(names, shown, strict=True)]
+    marked = [f"{name} {by_pair[pair]['mark']}".strip() for name, pair in zip(names, shown, strict=True)]
     ax.set_xticks(range(len(shown)), marked)
     ax.tick_params(axis="x", labelrotation=60, length=0)
     ax.set_ylim(-0.03, 1.05)
 
 
 def gate_arrows(results: Results) -> Figure:
-    """Each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates on
-    states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
+    """Return each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates
+    on states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
     AbsRec less FalseAbs: an arrow to the right tells voids from controls better, an arrow downwards pays for it with
     right answers."""
     rows = results.gate
@@ -151,11 +152,11 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
 
 
 def patching(results: Results) -> Figure:
-    """Indirect effect of each group of positions at each layer, for patches from the void into the control and back; 1
-    is the whole difference of the outcome. Framed cells were patched; the others are estimates to first order, from one
-    backward pass a pair. The residual stream is all that a block hands on; attention and MLP, where
-    they were patched, are what one block adds to it. stamps are the time stamps, changed and unchanged
-    the visual tokens whose pixels differ between the sides and those whose pixels do not; last is the last token."""
+    """Return indirect effect of each group of positions at each layer, for patches from the void into the control and
+    back; 1 is the whole difference of the outcome. Framed cells were patched; the others are estimates to first order,
+    from one backward pass a pair. The residual stream is all that a block hands on; attention and MLP, where they were
+    patched, are what one block adds to it. stamps are the time stamps, changed and unchanged the visual tokens whose
+    pixels differ between the sides and those whose pixels do not; last is the last token."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
     if not len(rows):
@@ -258,15 +259,15 @@ def doses_among_nulls(results: Results) -> Figure:
 
 
 def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
-    """The p of a direction among each of its nulls at the largest dose, a line a side."""
+    """Return the p of a direction among each of its nulls at the largest dose, a line a side."""
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
-    said: list[str] = []
+    lines: list[str] = []
     for side, sign in (("control", "+"), ("void", "−")):
         rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
         known = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
-        said += [f"p {sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
-    return said
+        lines += [f"p {sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
+    return lines
 
 
 def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:

@@ -26,7 +26,8 @@ MOST_MODELS = 12  # columns of a heatmap that stay legible on a page's width
 
 
 def sub_scenarios(results: Results) -> Figure:
-    """AbsRec by sub-scenario (rows, by falling AbsRec under standard) and model (columns), standard beside guided.
+    """Return AbsRec by sub-scenario (rows, by falling AbsRec under standard) and model (columns), standard beside
+    guided.
 
     Columns are the models that take video, or all others if none of those was asked, 12 at most. The paper prints only
     means over models, so for its numbers the columns are the figures that it prints. Blue is good, orange is bad.
@@ -62,7 +63,7 @@ class Panel:
 
 
 def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
-    """The panels of standard and of guided, a column a model."""
+    """Return the panels of standard and of guided, a column a model."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
     asked = [model for model in load_models() if model in set(cells["model"])]
@@ -107,8 +108,8 @@ def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImag
 
 
 def confabulation(results: Results) -> Figure:
-    """How often each axis applies to a model's sampled void failures, with 95 % Wilson intervals if the table has
-    them."""
+    """Return how often each axis applies to a model's sampled void failures, with 95 % Wilson intervals if the table
+    has them."""
     rows = results.confabulation
     if not len(rows):
         why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""

@@ -26,7 +26,8 @@ class Label:
 
 
 def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
-    """The labels, with those of coinciding points joined: one name per line, in the given order, in neutral colour."""
+    """Return the labels, with those of coinciding points joined: one name per line, in the given order, in neutral
+    colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     merged: list[Label] = []
     for label in labels:
@@ -48,7 +49,7 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
     pixel = axes.figure.dpi / 72  # pixels a point: offsets are in points, boxes in pixels
     room = np.array([axes.bbox.extents])
-    taken = _around(axes.transData.transform(markers), 3 * pixel)
+    obstacles = _around(axes.transData.transform(markers), 3 * pixel)
     lines = _around(_along_lines(axes, pixel), 0.5 * pixel)
     offsets = _offsets()
     distance = np.hypot(*offsets.T)
@@ -64,11 +65,11 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
             axes.transData.transform((label.x, label.y)) + offsets * pixel, offsets, size + np.array([4, 1]) * pixel
         )
         outside = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
-        area = 10 * (_overlap(boxes, taken) + outside) + 2 * _overlap(boxes, lines)
+        area = 10 * (_overlap(boxes, obstacles) + outside) + 2 * _overlap(boxes, lines)
         best = int(np.argmin(area / pixel**2 + distance))
         dx, dy = offsets[best]
         note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
-        taken = np.vstack([taken, boxes[best]])
+        obstacles = np.vstack([obstacles, boxes[best]])
         if distance[best] > 8 or "\n" in label.text:
             axes.annotate(
                 "", (label.x, label.y), (dx, dy), textcoords="offset points", annotation_clip=False, zorder=1.9,
@@ -77,47 +78,49 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
 
 def _offsets() -> np.ndarray:
-    """Candidate offsets (n, 2) in points of a label from its marker, nearest ring first, sides before diagonals."""
+    """Return candidate offsets (n, 2) in points of a label from its marker, nearest ring first, sides before
+    diagonals.
+    """
     angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
     rings = np.array([5, 9, 14, 20, 28, 38, 50, 64, 80])
     return np.round(rings[:, None, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 3).reshape(-1, 2)
 
 
 def _side(offset: float, positive: str, negative: str) -> str:
-    """The alignment by which a text extends away from its marker."""
+    """Return the alignment by which a text extends away from its marker."""
     return "center" if offset == 0 else positive if offset > 0 else negative
 
 
 def _boxes(anchors: np.ndarray, offsets: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Extents (n, 4) of a text of that size (2,), aligned by `_side` at each anchor; all in pixels."""
+    """Return extents (n, 4) of a text of that size (2,), aligned by `_side` at each anchor; all in pixels."""
     low = anchors - size * (1 - np.sign(offsets)) / 2
     return np.hstack([low, low + size])
 
 
 def _around(spots: np.ndarray, half: float) -> np.ndarray:
-    """Extents (n, 4) of squares around positions (n, 2)."""
+    """Return extents (n, 4) of squares around positions (n, 2)."""
     return np.hstack([spots - half, spots + half])
 
 
 def _along_lines(axes: Axes, step: float) -> np.ndarray:
-    """Pixel positions (n, 2) along the lines that join a model's points, `step` pixels apart."""
-    found = [np.empty((0, 2))]
+    """Return pixel positions (n, 2) along the lines that join a model's points, `step` pixels apart."""
+    points = [np.empty((0, 2))]
     for line in axes.lines:
         ends = axes.transData.transform(line.get_xydata())
         if line.get_zorder() == LINES and len(ends) == 2:
             count = int(np.hypot(*(ends[1] - ends[0])) / step) + 1
-            found.append(np.linspace(ends[0], ends[1], count))
-    return np.concatenate(found)
+            points.append(np.linspace(ends[0], ends[1], count))
+    return np.concatenate(points)
 
 
 def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Area (n,) that each box (n, 4) shares with all others (m, 4) together."""
+    """Return area (n,) that each box (n, 4) shares with all others (m, 4) together."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     return np.clip(high - low, 0, None).prod(axis=2).sum(axis=1)
 
 
 def short(model: str) -> str:
-    """A label's text: no line break, no more than 28 characters."""
+    """Return a label's text: no line break, no more than 28 characters."""
     text = "".join(c if c.isprintable() else "?" for c in model)
     return text if len(text) <= 28 else text[:27] + "…"

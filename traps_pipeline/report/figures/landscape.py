@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def landscape(results: Results) -> Figure:
-    """The PECS landscape of the overall figures, or of the first dataset if no model has all four."""
+    """Return the PECS landscape of the overall figures, or of the first dataset if no model has all four."""
     overall, cells = results.overall, results.cells
     if len(overall):
         return landscape_figure(overall, TITLES["overall"])
@@ -43,7 +43,7 @@ def landscape(results: Results) -> Figure:
 
 
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
-    """J (x) against Acc (y) of every model with iso-PECS contours, one column wide.
+    """Return J (x) against Acc (y) of every model with iso-PECS contours, one column wide.
 
     points has the columns model, regime, acc, j, pecs, incomplete. A hollow marker is standard, a filled one guided, an
     arrow connects them, and a dot is json; thin bars are 95 % intervals of the named point. The dashed line is the
@@ -67,7 +67,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
 
 
 def reasoning(results: Results) -> Figure:
-    """Arrows from the model that thinks less to the one that thinks more, under standard and under guided."""
+    """Return arrows from the model that thinks less to the one that thinks more, under standard and under guided."""
     points = results.overall
     chains = [list(reversed(pair)) for pair in analyses.REASONING_PAIRS] + [list(analyses.REASONING_LADDER)]
     chains = [[m for m in chain if m in set(points["model"])] for chain in chains]

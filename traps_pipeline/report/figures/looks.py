@@ -18,26 +18,27 @@ OWN, REFERENCE = "own", "reference"
 
 
 def family_of(model: str) -> str:
-    """The registry's family of a model; `own` if the model is not in the registry."""
+    """Return the registry's family of a model; `own` if the model is not in the registry."""
     entry = load_models().get(model)
     return entry.groups.family if entry else OWN
 
 
 def families() -> list[str]:
-    """All families: first the paper's, then the others in the registry's order, then `own`."""
+    """Return all families: first the paper's, then the others in the registry's order, then `own`."""
     known = [entry.groups for entry in load_models().values()]
     order = [g.family for g in known if g.group != "reference"] + [g.family for g in known if g.group == "reference"]
     return list(dict.fromkeys([*order, OWN]))
 
 
 def family_colour(family: str) -> str:
-    """The colour of a family in every figure; reference strategies are grey."""
+    """Return the colour of a family in every figure; reference strategies are grey."""
     others = [name for name in families() if name != REFERENCE]
     return COLOURS[-1] if family == REFERENCE else COLOURS[others.index(family) % (len(COLOURS) - 1)]
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each model: its family's colour, and a different marker for up to 13 models of a family."""
+    """Return colour and marker of each model: its family's colour, and a different marker for up to 13 models of a
+    family."""
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
@@ -63,7 +64,9 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str) -> None:
 
 
 def _limits(values: pd.Series, low: float, least: float) -> tuple[float, float]:
-    """Ends of an axis of fractions: tenths around the values, within [low, 1], the upper end at least `least`."""
+    """Return ends of an axis of fractions: tenths around the values, within [low, 1], the upper end at least
+    `least`.
+    """
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)

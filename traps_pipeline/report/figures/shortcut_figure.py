@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """How well each cue alone predicts the side, one column wide: a row of points for each dataset, a line at chance.
+    """Return how well each cue alone predicts the side, one column wide: a row of points for each dataset, a line at
+    chance.
 
     table is the result of `benchmark.shortcuts`.
     """

@@ -69,9 +69,9 @@ def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
 
 
 def probe_curves(results: Results) -> Figure:
-    """AUROC by layer of the twelve ordered pairs, with a row per model and a column per transfer type. The band shows
-    label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the layer chosen
-    without the target's labels."""
+    """Return AUROC by layer of the twelve ordered pairs, with a row per model and a column per transfer type. The band
+    shows label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the layer
+    chosen without the target's labels."""
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
@@ -122,8 +122,9 @@ def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def confabulated_strip(results: Results) -> Figure:
-    """AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls (filled), both
-    at the best layer of all samples; the bar is the median of the model's filled markers, the dashed line is chance."""
+    """Return AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls
+    (filled), both at the best layer of all samples; the bar is the median of the model's filled markers, the dashed
+    line is chance."""
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
         absent = "no dataset has confabulated voids" if len(rows) else why(results)
@@ -192,13 +193,13 @@ def dose_response(results: Results) -> Figure:
 
 
 def _answers(part: pd.DataFrame, side: str) -> str:
-    """How many answers a marker stands for."""
+    """Return how many answers a marker stands for."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
     return f", n {from_to(min(counts), max(counts))}" if len(counts) else ""
 
 
 def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
-    """The shares over a panel's paths along void directions, by alpha."""
+    """Return the shares over a panel's paths along void directions, by alpha."""
     of_side = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
     return of_side.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
 
@@ -210,17 +211,17 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Rows of each model and complete path set, under guided inference with directions of the standard prompt, or the
-    regimes next to them that the model has."""
-    found: dict[tuple[str, str], pd.DataFrame] = {}
+    """Return rows of each model and complete path set, under guided inference with directions of the standard prompt,
+    or the regimes next to them that the model has."""
+    panels: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "standard").astype(int) + 2 * (of["regime"] == "guided").astype(int)
         of = of.loc[guided == guided.max()]
         for path_set, members in PATH_SETS.items():
             part = of.loc[[pair in members for pair in zip(of["source"], of["target"], strict=True)]]
             if set(zip(part["source"], part["target"], strict=True)) == set(members):
-                found[str(model), path_set] = part
-    return found
+                panels[str(model), path_set] = part
+    return panels
 
 
 def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str, str]]) -> None:
@@ -238,11 +239,11 @@ def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str
 
 
 def cosine_heatmaps(results: Results) -> Figure:
-    """Cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one scale of
-    ±0.6. Below the diagonal: of the directions themselves. Above it: without the noise of few pairs and of shared
-    controls, with a star where the 95 % interval excludes 0. On the diagonal: of the directions of two halves of the
-    pairs; where it is low, a small cosine says nothing. A dash is a pair without a figure; the paper has one figure a
-    pair."""
+    """Return cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one
+    scale of ±0.6. Below the diagonal: of the directions themselves. Above it: without the noise of few pairs and of
+    shared controls, with a star where the 95 % interval excludes 0. On the diagonal: of the directions of two halves of
+    the pairs; where it is low, a small cosine says nothing. A dash is a pair without a figure; the paper has one figure
+    a pair."""
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):
@@ -265,10 +266,10 @@ def cosine_heatmaps(results: Results) -> Figure:
 
 def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     names = [TITLES[name].replace(", ill", ",\nill") for name in DATASETS]
-    found = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
+    by_pair = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
     for (row, one), (column, other) in product(enumerate(DATASETS), repeat=2):
-        at = found.get((one, other), {})
+        at = by_pair.get((one, other), {})
         cleaned = row < column and _known(at.get("disattenuated"))
         figure = at.get("split_half" if row == column else "disattenuated" if cleaned else "cosine")
         if not _known(figure):

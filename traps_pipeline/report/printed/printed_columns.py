@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
-    """The paper's table `name` of `tables.csv`, which has its title, its place in the paper and its notes."""
+    """Return the paper's table `name` of `tables.csv`, which has its title, its place in the paper and its notes."""
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
     where = f"as the paper prints it, line {about['line']} of its source"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
@@ -29,12 +29,12 @@ def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> Printe
 
 
 def figures(names: Mapping[str, str]) -> list[Column]:
-    """Columns of figures (field: heading), which are shown as the paper prints them."""
+    """Return columns of figures (field: heading), which are shown as the paper prints them."""
     return [Column(field, heading, "range") for field, heading in names.items()]
 
 
 def with_spread(rows: pd.DataFrame, fields: Iterable[str], spreads: Iterable[str]) -> pd.DataFrame:
-    """The rows with `field ± spread` in place of each field whose spread is printed."""
+    """Return the rows with `field ± spread` in place of each field whose spread is printed."""
     changed = {}
     for field, spread in zip(fields, spreads, strict=True):
         pairs = zip(rows[field], rows[spread], strict=True)
@@ -43,7 +43,7 @@ def with_spread(rows: pd.DataFrame, fields: Iterable[str], spreads: Iterable[str
 
 
 def in_text(card: str) -> list[PrintedTable]:
-    """The figures that stand only in the paper's text and belong to this card; no table if there are none."""
+    """Return the figures that stand only in the paper's text and belong to this card; no table if there are none."""
     rows = as_printed("other").query("card == @card")
     columns = [
         Column("model", "Model"), Column("quantity", "Quantity"), Column("printed", "Value", "range"),

@@ -18,7 +18,7 @@ ALPHAS = ("0", "2", "5", "10")
 
 
 def probes() -> list[PrintedTable]:
-    """Probe transfer of the three families: by ordered pair, and means by transfer type."""
+    """Return probe transfer of the three families: by ordered pair, and means by transfer type."""
     pairs = _paths(as_printed("probe_transfer"))
     pairs["best_layer"] = "L" + pairs["best_layer"]
     wide: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
@@ -43,7 +43,7 @@ def probes() -> list[PrintedTable]:
 
 
 def cosines() -> list[PrintedTable]:
-    """Cosines of the directions of the first family, and what the text says of the others."""
+    """Return cosines of the directions of the first family, and what the text says of the others."""
     rows = as_printed("cosine_qwen")
     order = [*dict.fromkeys(rows["source"])]
     rows["cosine"] = rows["cosine"].str.replace("-", "−")
@@ -53,7 +53,7 @@ def cosines() -> list[PrintedTable]:
 
 
 def steering() -> list[PrintedTable]:
-    """Steering by regimes and families, at alpha 10, by alpha, and within or across domains."""
+    """Return steering by regimes and families, at alpha 10, by alpha, and within or across domains."""
     return [_regimes(), _top(), _domains(), _dose("qwen"), _dose("gemma"), *in_text("steering")]
 
 

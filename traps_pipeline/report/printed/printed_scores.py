@@ -22,7 +22,7 @@ REGIME = Column("regime", "Regime", look="tag")
 
 
 def overall() -> list[PrintedTable]:
-    """All sixteen models under the three regimes."""
+    """Return all sixteen models under the three regimes."""
     rows = as_printed("overall")
     wide: pd.DataFrame = rows.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
@@ -35,12 +35,12 @@ def overall() -> list[PrintedTable]:
 
 
 def replication_overall() -> list[PrintedTable]:
-    """The two replication families, with one decimal."""
+    """Return the two replication families, with one decimal."""
     return [of_paper("replication_overall", as_printed("replication_overall"), [MODEL, REGIME, *figures(SHARES)])]
 
 
 def per_dataset() -> list[PrintedTable]:
-    """PECS of the fourteen main-family models on each dataset under each regime."""
+    """Return PECS of the fourteen main-family models on each dataset under each regime."""
     cells = _cells("main")
     wide: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
@@ -54,7 +54,7 @@ def per_dataset() -> list[PrintedTable]:
 
 
 def expanded() -> list[PrintedTable]:
-    """Twelve tables, one for each dataset and regime."""
+    """Return twelve tables, one for each dataset and regime."""
     cells = _cells("main")
     order = ("acc_pct", "false_abs_pct", "abs_rec_pct", "pecs")
     columns = [MODEL, *figures({field: SHARES[field] for field in order})]
@@ -63,7 +63,7 @@ def expanded() -> list[PrintedTable]:
 
 
 def replication_per_dataset() -> list[PrintedTable]:
-    """The two replication families on each dataset under each regime."""
+    """Return the two replication families on each dataset under each regime."""
     cells = _cells("replication")
     keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in PRINTED_REGIMES]
     cells = titled(cells.set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
@@ -80,7 +80,7 @@ def _cells(group: str) -> pd.DataFrame:
 
 
 def visual_textual() -> list[PrintedTable]:
-    """AbsRec on visual and on textual voids, and their ratio, by taxonomy."""
+    """Return AbsRec on visual and on textual voids, and their ratio, by taxonomy."""
     rows: pd.DataFrame = as_printed("visual_vs_textual")
     daggers = ["†" if epoch == "verification" else "" for epoch in rows["epoch"]]
     rows = rows.assign(model=rows["model"] + daggers)
@@ -94,7 +94,7 @@ def visual_textual() -> list[PrintedTable]:
 
 
 def naive() -> list[PrintedTable]:
-    """The cells under guided in which Acc × AbsRec exceeds PECS most."""
+    """Return the cells under guided in which Acc × AbsRec exceeds PECS most."""
     rows = as_printed("pecs_vs_naive")
     rows = titled(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
     columns = [MODEL, DATASET, *figures({"naive": "Naive", "pecs": "PECS", "false_abs_pct": "FA"})]
@@ -102,14 +102,14 @@ def naive() -> list[PrintedTable]:
 
 
 def degenerate() -> list[PrintedTable]:
-    """Six strategies whose PECS is 0, and why."""
+    """Return six strategies whose PECS is 0, and why."""
     columns = figures({"acc": "Acc", "false_abs": "FA", "abs_rec": "AR", "j": "J"})
     columns = [Column("strategy", "Strategy"), *columns, Column("why", "Why PECS = 0")]
     return [of_paper("degenerate_strategies", as_printed("degenerate_strategies"), columns)]
 
 
 def occlusion_sub_scenarios() -> list[PrintedTable]:
-    """The fifteen occlusion sub-scenarios."""
+    """Return the fifteen occlusion sub-scenarios."""
     names = {"acc_pct": "Acc", "false_abs_pct": "FA", "abs_rec_pct": "AR", "guided_abs_rec_pct": "G-AR"}
     columns = [Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer type"), *figures(names)]
     rows = as_printed("occlusion_subscenarios")
@@ -117,7 +117,7 @@ def occlusion_sub_scenarios() -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios() -> list[PrintedTable]:
-    """The three chaotic sub-scenarios of the original benchmark, and their uplift under guided."""
+    """Return the three chaotic sub-scenarios of the original benchmark, and their uplift under guided."""
     rows = as_printed("chaotic_subscenarios")
     names = {
         "acc_pct": "Acc", "false_abs_pct": "FA", "abs_rec_pct": "AR", "pecs": "PECS",
@@ -137,15 +137,15 @@ def chaotic_sub_scenarios() -> list[PrintedTable]:
 
 
 def guided_uplift() -> list[PrintedTable]:
-    """What the text says of AbsRec under guided against standard."""
+    """Return what the text says of AbsRec under guided against standard."""
     return in_text("guided_uplift")
 
 
 def zero_boundary() -> list[PrintedTable]:
-    """What the text says of cells with PECS 0."""
+    """Return what the text says of cells with PECS 0."""
     return in_text("zero_boundary")
 
 
 def run_spread() -> list[PrintedTable]:
-    """What the text says of the spread over runs."""
+    """Return what the text says of the spread over runs."""
     return in_text("run_spread")

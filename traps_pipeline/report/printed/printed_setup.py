@@ -12,14 +12,14 @@ SIZES = {"occlusion": "202", "occlusion_ill_posed": "202", "chaotic": "500", "ch
 
 
 def models() -> list[PrintedTable]:
-    """The sixteen models by the paper's names."""
+    """Return the sixteen models by the paper's names."""
     words = {"name": "Name", "type": "Type", "input": "Input", "notes": "Notes"}
     columns = [MODEL, *(Column(field, heading) for field, heading in words.items())]
     return [of_paper("models", as_printed("models"), columns)]
 
 
 def composition() -> list[PrintedTable]:
-    """Scenes and questions by dataset, with the source of the void."""
+    """Return scenes and questions by dataset, with the source of the void."""
     import pandas as pd
 
     rows = as_printed("composition")
@@ -34,14 +34,14 @@ def composition() -> list[PrintedTable]:
 
 
 def hyperparameters() -> list[PrintedTable]:
-    """What all models and all judges are sent."""
+    """Return what all models and all judges are sent."""
     columns = [Column("parameter", "Parameter"), *figures({"model_calls": "VLM calls", "judge_calls": "Judge calls"})]
     rows = as_printed("hyperparameters").replace({"judge_calls": {"": "–"}})
     return [of_paper("hyperparameters", rows, columns)]
 
 
 def agreement() -> list[PrintedTable]:
-    """Unanimity and Fleiss' kappa by dataset and task."""
+    """Return unanimity and Fleiss' kappa by dataset and task."""
     rows = as_printed("judge_agreement")
     rows = titled(rows.assign(unanimous_pct=rows["unanimous_pct"] + "%"))
     columns = [DATASET, Column("task", "Judge task")]
@@ -50,7 +50,7 @@ def agreement() -> list[PrintedTable]:
 
 
 def validation() -> list[PrintedTable]:
-    """The confabulation judge against two annotators."""
+    """Return the confabulation judge against two annotators."""
     rows = as_printed("judge_validation")
     rows["human_kappa"] = [value or "–*" for value in rows["human_kappa"]]
     names = {
@@ -62,7 +62,7 @@ def validation() -> list[PrintedTable]:
 
 
 def confabulation() -> list[PrintedTable]:
-    """Prevalence of the four axes in six models."""
+    """Return prevalence of the four axes in six models."""
     rows = as_printed("confabulation_taxonomy")
     names = {"hp_pct": "HP", "ii_pct": "II", "hp_and_ii_pct": "HP∩II", "es_pct": "ES", "doubt_pct": "Doubt"}
     rows[[*names]] = rows[[*names]] + "%"

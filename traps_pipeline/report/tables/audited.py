@@ -10,7 +10,7 @@ from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text
 
 @cache
 def audit_table() -> PrintedTable:
-    """Every statement that differs from what the paper's tables give, with its line and the arithmetic."""
+    """Return every statement that differs from what the paper's tables give, with its line and the arithmetic."""
     findings = audit()
     rows = findings.loc[findings["verdict"].isin([DIFFERS, DECLARED])].reset_index(drop=True)
     columns = [

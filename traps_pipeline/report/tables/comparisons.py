@@ -46,7 +46,7 @@ NAIVE_THRESHOLD = 0.03
 
 
 def visual_textual(results: Results) -> list[PrintedTable]:
-    """AbsRec under standard on visual and on ill-posed voids, and their ratio, by taxonomy and pooled."""
+    """Return AbsRec under standard on visual and on ill-posed voids, and their ratio, by taxonomy and pooled."""
     rates = marked(results.rates)
     rows = rates.drop_duplicates("model", keep="last").loc[
         :, ["model", *COUNTED, "mark"]
@@ -87,7 +87,7 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 
 def uplift(results: Results) -> list[PrintedTable]:
-    """AbsRec under guided and standard (equal weight over datasets), their ratio, and PECS of both."""
+    """Return AbsRec under guided and standard (equal weight over datasets), their ratio, and PECS of both."""
     rows, refused, both = [], [], PROMPTING
     for model, means in marked(results.overall).groupby("model", sort=False):
         sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in both}
@@ -127,7 +127,7 @@ def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 
 def naive(results: Results) -> list[PrintedTable]:
-    """Cells under guided, by the difference between Acc x AbsRec, which ignores false abstention, and PECS."""
+    """Return cells under guided, by the difference between Acc x AbsRec, which ignores false abstention, and PECS."""
     cells = results.cells.loc[results.cells["regime"] == GUIDED]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
@@ -150,7 +150,8 @@ def naive(results: Results) -> list[PrintedTable]:
 
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
-    """Cells with PECS 0, in which a model does not distinguish void from control or answers no control correctly."""
+    """Return cells with PECS 0, in which a model does not distinguish void from control or answers no control
+    correctly."""
     rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
@@ -163,7 +164,7 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
 
 
 def frontier(results: Results) -> list[PrintedTable]:
-    """The Pareto frontier in (Acc, J) under each regime, after averaging over datasets."""
+    """Return the Pareto frontier in (Acc, J) under each regime, after averaging over datasets."""
     rows = ordered(marked(analyses.frontier(results.overall)), ["regime"])
     columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
     notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
@@ -171,7 +172,7 @@ def frontier(results: Results) -> list[PrintedTable]:
 
 
 def reasoning(results: Results) -> list[PrintedTable]:
-    """The thinking member of each pair minus the other, by dataset and overall."""
+    """Return the thinking member of each pair minus the other, by dataset and overall."""
     import pandas as pd
 
     cells = entries(results)
@@ -208,7 +209,9 @@ TOO_FEW = "too few"
 
 
 def contrasts(results: Results) -> list[PrintedTable]:
-    """Paired contrasts of overall PECS between models of one regime, or regimes of one model; Holm's correction."""
+    """Return paired contrasts of overall PECS between models of one regime, or regimes of one model; Holm's
+    correction.
+    """
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
     known = rows["separable"].map({True: "yes", False: "no"}).astype(object)
@@ -232,7 +235,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
 
 
 def regime_tests(results: Results) -> list[PrintedTable]:
-    """McNemar's test of two regimes on the same items, by dataset, model and run."""
+    """Return McNemar's test of two regimes on the same items, by dataset, model and run."""
     rows = ordered(titled(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
         DATASET, MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
@@ -246,7 +249,7 @@ def regime_tests(results: Results) -> list[PrintedTable]:
 
 
 def spreads(results: Results) -> list[PrintedTable]:
-    """Quartiles of the standard deviations of PECS over runs, by family."""
+    """Return quartiles of the standard deviations of PECS over runs, by family."""
     cells: pd.DataFrame = results.cells
     families = {entry.id: entry.groups.family for entry in load_models().values()}
     rows = []
@@ -268,7 +271,7 @@ def spreads(results: Results) -> list[PrintedTable]:
 
 
 def degenerate(results: Results) -> list[PrintedTable]:
-    """The expected figures of strategies that do not discriminate, and their measured figures in this study."""
+    """Return the expected figures of strategies that do not discriminate, and their measured figures in this study."""
     rows = analyses.degenerate_strategies()
     columns = [
         Column("strategy", "Strategy"), *SHARES, Column("j", "J", "fraction"), Column("naive", "Naive", "fraction"),

@@ -45,15 +45,15 @@ WHAT = {
 
 
 def probe_baselines(results: Results) -> list[PrintedTable]:
-    """The probe on states beside probes on raw inputs, on the output margin and on noise: on every pair of datasets,
-    and on clips that only look like voids."""
+    """Return the probe on states beside probes on raw inputs, on the output margin and on noise: on every pair of
+    datasets, and on clips that only look like voids."""
     return [_beside(results), _look_alikes(results)]
 
 
 def beside(results: Results) -> pd.DataFrame:
-    """One row per model and ordered pair of datasets, a dataset on itself among them: the probe at the target's chosen
-    layer, with its interval, and each baseline. Within a taxonomy all of them are fitted without the scored scenario
-    (`held_out`), elsewhere on all of the source (`transfer`)."""
+    """Return one row per model and ordered pair of datasets, a dataset on itself among them: the probe at the target's
+    chosen layer, with its interval, and each baseline. Within a taxonomy all of them are fitted without the scored
+    scenario (`held_out`), elsewhere on all of the source (`transfer`)."""
     import pandas as pd
 
     wanted = pd.DataFrame(
@@ -139,8 +139,8 @@ AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_s
 
 
 def steering_nulls(results: Results) -> list[PrintedTable]:
-    """The effect of void directions on their own datasets among nulls of the same length, and PECS of the steered
-    model under each sign policy."""
+    """Return the effect of void directions on their own datasets among nulls of the same length, and PECS of the
+    steered model under each sign policy."""
     return [_nulls(results), _pecs(results)]
 
 
@@ -171,7 +171,7 @@ def _nulls(results: Results) -> PrintedTable:
 
 
 def _ahead(rows: pd.DataFrame) -> list[str]:
-    """Where the void direction is ahead of all but a twentieth of its nulls, in words."""
+    """Return where the void direction is ahead of all but a twentieth of its nulls, in words."""
     own = rows.loc[rows["target"] != "all"]
     if own.empty:
         return []
@@ -221,8 +221,9 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 
 def gate(results: Results) -> list[PrintedTable]:
-    """Probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on other
-    features; what it does to items that must be answered; and what the guided prompt does to answers and to states."""
+    """Return probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on
+    other features; what it does to items that must be answered; and what the guided prompt does to answers and to
+    states."""
     return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
 
 
@@ -241,7 +242,8 @@ _GATE_NOTES = (
 
 
 def _gates(results: Results) -> pd.DataFrame:
-    """The rows of gates: those on states first, from the other datasets, at the mid threshold, over all datasets."""
+    """Return the rows of gates: those on states first, from the other datasets, at the mid threshold, over all
+    datasets."""
     rows = results.gate
     firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
     later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
@@ -306,7 +308,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
 
 
 def prompts(results: Results) -> pd.DataFrame:
-    """One row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
+    """Return one row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
     prompts the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario) and of the output
     margin; those of the best raw input and of noise; n_answered, the fewest voids that were answered under either
     prompt, n_voids and n_controls of the probe."""

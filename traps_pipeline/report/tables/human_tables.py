@@ -19,7 +19,7 @@ _PERCENT = (*SHARES, "sensitivity", "specificity")
 
 
 def people(results: Results) -> list[PrintedTable]:
-    """What people score on the clips, by dataset, and how far people agree about clips and answers."""
+    """Return what people score on the clips, by dataset, and how far people agree about clips and answers."""
     rows = ordered(titled(results.human_row), ["dataset"])
     rows = _with_intervals(rows, [*_FIGURES])
     figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
@@ -50,7 +50,7 @@ def people(results: Results) -> list[PrintedTable]:
 
 
 def judge_corrected(results: Results) -> list[PrintedTable]:
-    """The panel against people, and the leaderboard as judged and corrected for the panel's errors."""
+    """Return the panel against people, and the leaderboard as judged and corrected for the panel's errors."""
     errors = _with_intervals(results.panel_errors, ["sensitivity", "specificity"])
     of_panel = [
         Column("task", "Task"), Column("sensitivity_shown", "Sensitivity %", "range"),
@@ -84,7 +84,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
 
 
 def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
-    """The rows with `FIELD_shown`: the figure and its interval as printed."""
+    """Return the rows with `FIELD_shown`: the figure and its interval as printed."""
     shown = {f"{field}_shown": [_shown(row, field) for row in rows.to_dict("records")] for field in fields}
     return rows.assign(**shown)
 
@@ -96,8 +96,8 @@ def _shown(row: Mapping[Any, Any], field: str) -> str:
 
 
 def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
-    """Notes beside a leaderboard, from HUMAN_ROW and PANEL_ERRORS rows: what people score, and whether the panel was
-    validated."""
+    """Return notes beside a leaderboard, from HUMAN_ROW and PANEL_ERRORS rows: what people score, and whether the panel
+    was validated."""
     return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
 
 
@@ -115,9 +115,9 @@ def _score_of_people(rows: pd.DataFrame) -> str:
 def _validated(rows: pd.DataFrame) -> str:
     if rows.empty:
         return "not validated, people have labelled none of its answers (run traps people annotate)"
-    told = [
+    remarks = [
         f"{row['task']} sensitivity {_shown(row, 'sensitivity')} %, specificity {_shown(row, 'specificity')} %"
         for row in rows.to_dict("records")
     ]
-    lacking = " (the other task is not validated)" if len(told) == 1 else ""
-    return f"against people {'; '.join(told)}{lacking}"
+    lacking = " (the other task is not validated)" if len(remarks) == 1 else ""
+    return f"against people {'; '.join(remarks)}{lacking}"

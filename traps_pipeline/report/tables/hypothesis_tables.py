@@ -26,7 +26,8 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 
 def hypotheses(results: Results) -> list[PrintedTable]:
-    """How answers and abstentions change when one thing of the pairs is changed step by step, beside what rules get."""
+    """Return how answers and abstentions change when one thing of the pairs is changed step by step, beside what rules
+    get."""
     from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
@@ -72,7 +73,7 @@ def _figure(row: Mapping[Any, Any], name: str) -> str:
 
 
 def _rule(row: Mapping[Any, Any], name: str) -> str:
-    """A rule's figure with its name, or "not run"."""
+    """Return a rule's figure with its name, or "not run"."""
     rule, value = row["rule" if name == "value" else "rule_changing"], percent(row[f"rule_{name}"])
     if isinstance(rule, str):
         return f"{value} ({rule.removesuffix('-rule')})"

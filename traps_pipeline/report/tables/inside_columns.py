@@ -24,14 +24,16 @@ FEW_MARK = "†"
 
 
 def why(results: Results, of_paper: str = "") -> str:
-    """The reason why a frame of what is found inside models has no rows. of_paper: that of the paper's results."""
+    """Return the reason why a frame of what is found inside models has no rows. of_paper: that of the paper's
+    results.
+    """
     if of_paper and not results.is_study:
         return of_paper
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """The mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
+    """Return the mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
     import pandas as pd
 
     numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
@@ -39,13 +41,15 @@ def few(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
-    """The meaning of the mark, if a row has it in one of these columns (default: `mark`). of: what is counted."""
+    """Return the meaning of the mark, if a row has it in one of these columns (default: `mark`). of: what is
+    counted.
+    """
     used = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if used else []
 
 
 def interval(prefix: str = "", unit: str = "fraction", digits: int | None = None) -> list[Column]:
-    """The columns of the ends of an interval, `low` and `high` with a prefix."""
+    """Return the columns of the ends of an interval, `low` and `high` with a prefix."""
     return [
         Column(f"{prefix}{end}", word, unit, digits)  # pyright: ignore[reportArgumentType] - a Unit
         for end, word in (("low", "from"), ("high", "to"))
@@ -53,10 +57,10 @@ def interval(prefix: str = "", unit: str = "fraction", digits: int | None = None
 
 
 def short_names(names: Iterable[str]) -> list[str]:
-    """The datasets' short names; of anything else its own name, where it is stated."""
+    """Return the datasets' short names; of anything else its own name, where it is stated."""
     return [SHORT.get(name, name) if isinstance(name, str) and name else "not stated" for name in names]
 
 
 def path_names(rows: pd.DataFrame) -> list[str]:
-    """The path of each row, from its source to its target."""
+    """Return the path of each row, from its source to its target."""
     return [path_name(source, target) for source, target in zip(rows["source"], rows["target"], strict=True)]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def agreement(results: Results) -> list[PrintedTable]:
-    """The panel's agreement by dataset and task, and the lowest agreement of any two of its judges."""
+    """Return the panel's agreement by dataset and task, and the lowest agreement of any two of its judges."""
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
@@ -52,7 +52,7 @@ def _undefined(rows: pd.DataFrame) -> list[str]:
 
 
 def judge_bias(results: Results) -> list[PrintedTable]:
-    """The bias of every judge against the panel, and PECS without that judge."""
+    """Return the bias of every judge against the panel, and PECS without that judge."""
     bias = ordered(titled(results.bias), ["dataset", "task", "judge"])
     columns = [
         DATASET, Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),
@@ -77,7 +77,7 @@ def judge_bias(results: Results) -> list[PrintedTable]:
 
 
 def validation(results: Results) -> list[PrintedTable]:
-    """The confabulation judge against human labels."""
+    """Return the confabulation judge against human labels."""
     rows = results.validation
     columns = [
         Column("axis", "Axis"), Column("accuracy", "Accuracy %", "percent"),
@@ -103,7 +103,7 @@ def validation(results: Results) -> list[PrintedTable]:
 
 
 def confabulation(results: Results) -> list[PrintedTable]:
-    """How often each axis of confabulation applies to a model's void failures."""
+    """Return how often each axis of confabulation applies to a model's void failures."""
     rows = results.confabulation
     names = {"hp": "HP %", "ii": "II %", "hp_and_ii": "HP and II %", "es": "ES %", "doubt": "Doubt %"}
     columns = [MODEL, Column("n", "n", "count"), *(Column(field, text, "percent", 0) for field, text in names.items())]

@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 
 
 def overall(results: Results) -> list[PrintedTable]:
-    """The overall leaderboard: every model except the replication families, best PECS first."""
+    """Return the overall leaderboard: every model except the replication families, best PECS first."""
     return [_overall(results, "overall", "Overall leaderboard", replication=False)]
 
 
 def replication_overall(results: Results) -> list[PrintedTable]:
-    """The replication families, overall."""
+    """Return the replication families, overall."""
     return [_overall(results, "replication_overall", "Replication families, overall", replication=True)]
 
 
@@ -68,12 +68,12 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
 
 
 def per_dataset(results: Results) -> list[PrintedTable]:
-    """PECS of every model and regime on each dataset, and overall."""
+    """Return PECS of every model and regime on each dataset, and overall."""
     return [_by_dataset(results, "per_dataset", "PECS by dataset", replication=False)]
 
 
 def replication_per_dataset(results: Results) -> list[PrintedTable]:
-    """The replication families' figures on each dataset."""
+    """Return the replication families' figures on each dataset."""
     cells = marked(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
     rows = ordered(titled(rows), ["model", "dataset", "regime"])
@@ -115,13 +115,13 @@ def _by_dataset(results: Results, name: str, title: str, replication: bool) -> P
 
 
 def _n(title: str, part: pd.DataFrame, names: Mapping[str, str]) -> str:
-    """A heading with the number of pairs, if it is the same in all rows."""
+    """Return a heading with the number of pairs, if it is the same in all rows."""
     counts = part[names["n_pairs"]].dropna().unique()
     return f"{title} (n = {int(counts[0])})" if len(counts) == 1 else title
 
 
 def expanded(results: Results) -> list[PrintedTable]:
-    """Twelve tables, one per dataset and regime: Acc, AbsRec, FalseAbs and PECS of every model."""
+    """Return twelve tables, one per dataset and regime: Acc, AbsRec, FalseAbs and PECS of every model."""
     cells = marked(results.cells)
     tables = []
     for dataset in DATASETS:

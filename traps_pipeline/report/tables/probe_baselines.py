@@ -27,8 +27,8 @@ NOTES = (
 
 
 def by_features(results: Results) -> pd.DataFrame:
-    """One row per model, prompt, analysis, source and target of `probe_baselines`: the value of each of its features,
-    and noise_spread."""
+    """Return one row per model, prompt, analysis, source and target of `probe_baselines`: the value of each of its
+    features, and noise_spread."""
     import pandas as pd
 
     rows = results.baselines
@@ -39,13 +39,13 @@ def by_features(results: Results) -> pd.DataFrame:
 
 
 def other_probes(results: Results) -> list[str]:
-    """The further probes of the states that experiments name, as features of `probe_baselines`."""
+    """Return the further probes of the states that experiments name, as features of `probe_baselines`."""
     return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
 
 
 def against(results: Results, analysis: str) -> pd.DataFrame:
-    """BESIDE of each model, source and target under an analysis: the best raw input (its name, its AUROC), the output
-    margin and noise."""
+    """Return BESIDE of each model, source and target under an analysis: the best raw input (its name, its AUROC), the
+    output margin and noise."""
     import pandas as pd
 
     rows = by_features(results)
@@ -57,15 +57,15 @@ def against(results: Results, analysis: str) -> pd.DataFrame:
 
 
 def best_name(values: Mapping[Any, float]) -> str:
-    """The feature with the highest AUROC, the first of equals; NO_RAW where none is above chance, empty where there is
-    none at all."""
+    """Return the feature with the highest AUROC, the first of equals; NO_RAW where none is above chance, empty where
+    there is none at all."""
     known = {str(name): value for name, value in values.items() if value == value}
     best = max(known, key=lambda name: known[name], default="")
     return NO_RAW if best and known[best] <= 0.5 else best
 
 
 def columns(results: Results, prefix: str = "", head: str = "") -> list[Column]:
-    """The columns of BESIDE; none for the paper, which has no baselines."""
+    """Return the columns of BESIDE; none for the paper, which has no baselines."""
     if not results.is_study:
         return []
     return [
@@ -76,5 +76,5 @@ def columns(results: Results, prefix: str = "", head: str = "") -> list[Column]:
 
 
 def notes(results: Results) -> list[str]:
-    """What the columns of BESIDE are; nothing of the paper, which has none."""
+    """Return what the columns of BESIDE are; nothing of the paper, which has none."""
     return [*NOTES] if results.is_study else []

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def probes(results: Results) -> list[PrintedTable]:
-    """Probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
+    """Return probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
     layer that is chosen without the target's labels."""
     pairs = _pairs(results)
     tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
@@ -76,8 +76,8 @@ BASELINES = {
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target, and
-    Cf->Cf at its own and at the best layer, as FIGURES."""
+    """Return one row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target,
+    and Cf->Cf at its own and at the best layer, as FIGURES."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -101,7 +101,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _pairs(results: Results) -> pd.DataFrame:
-    """`best_layers` with BASELINES beside its figures, and marks."""
+    """Return `best_layers` with BASELINES beside its figures, and marks."""
     rows = best_layers(results.probes)
     if not len(rows):
         return rows
@@ -197,12 +197,12 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
 
 
 def _listed(names: pd.Series) -> str:
-    """The names, each once, the most frequent first."""
+    """Return the names, each once, the most frequent first."""
     return ", ".join(name for name, _ in Counter(str(name) for name in names if name).most_common())
 
 
 def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
-    """The figure without the scored scenario, and the floor of noise under that split."""
+    """Return the figure without the scored scenario, and the floor of noise under that split."""
     if not results.is_study:
         return []
     noise, spread = f"{prefix}held_noise", f"{prefix}held_noise_spread"
@@ -213,7 +213,7 @@ def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column
 
 
 def _shared_controls(results: Results) -> list[str]:
-    """Notes on cross-modality pairs, which share their controls."""
+    """Return notes on cross-modality pairs, which share their controls."""
     notes = [
         "cross-modality: both datasets have the same control items, so half of the target’s rows were used in the fit"
     ]
@@ -284,7 +284,7 @@ def _catch(results: Results) -> PrintedTable:
 
 
 def _caught_columns() -> Iterator[Column]:
-    """What each kind of baseline catches, and its share of controls."""
+    """Yield what each kind of baseline catches, and its share of controls."""
     yield Column("raw", "Best raw input")
     for name, heading in (("raw", "catches %"), ("margin", "Output margin %"), ("noise", "Noise %")):
         yield Column(f"{name}_void", heading, "percent")
@@ -292,15 +292,15 @@ def _caught_columns() -> Iterator[Column]:
 
 
 def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of nearest centroids by sub-scenario, with the column sub_scenario."""
+    """Return rows of nearest centroids by sub-scenario, with the column sub_scenario."""
     rows = rows.loc[rows["analysis"].isin(["centroid_void", "centroid_control"]) & (rows["scope"] != "all")]
     names = rows["scope"].astype(object).str.removeprefix("sub_scenario:")
     return rows.assign(sub_scenario=names, target=rows["target"].astype(object).fillna(""))
 
 
 def _caught_beside(results: Results) -> pd.DataFrame:
-    """One row per model, target and sub-scenario: what the best raw input, the output margin and noise catch, and the
-    share of controls that they assign to void, means over sources."""
+    """Return one row per model, target and sub-scenario: what the best raw input, the output margin and noise catch,
+    and the share of controls that they assign to void, means over sources."""
     import pandas as pd
 
     keys = ["model", "target", "sub_scenario"]

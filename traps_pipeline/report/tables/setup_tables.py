@@ -17,7 +17,7 @@ from traps_pipeline.storage.media import MediaSpec
 
 
 def models(results: Results) -> list[PrintedTable]:
-    """The evaluated models: provider, how a clip is shown, and the number of runs, from the registry."""
+    """Return the evaluated models: provider, how a clip is shown, and the number of runs, from the registry."""
     rows = []
     for entry in _entries(results):
         rows.append(
@@ -44,7 +44,7 @@ def _shown(media: MediaSpec | None) -> str:
 
 
 def hyperparameters(results: Results) -> list[PrintedTable]:
-    """The parameters that models and judges are sent, and where they depart from the protocol."""
+    """Return the parameters that models and judges are sent, and where they depart from the protocol."""
     judges = [*load_judges().values()]
     if results.is_study:
         voted = set(results.bias["judge"])
@@ -88,13 +88,13 @@ def _flat(value: Any) -> str:
 
 
 def _entries(results: Results) -> Iterable[ModelEntry]:
-    """Registry entries of the models with results, in the registry's order."""
+    """Return registry entries of the models with results, in the registry's order."""
     evaluated = set(results.cells["model"])
     return [entry for entry in load_models().values() if entry.id in evaluated]
 
 
 def composition(results: Results) -> list[PrintedTable]:
-    """Pairs by category."""
+    """Return pairs by category."""
     import pandas as pd
 
     rows = results.composition

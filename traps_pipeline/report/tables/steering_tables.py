@@ -41,8 +41,8 @@ SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def cosines(results: Results) -> list[PrintedTable]:
-    """Cosines of void directions at the steered layer, with what few pairs take away from them: of datasets under one
-    prompt, and of a dataset under both."""
+    """Return cosines of void directions at the steered layer, with what few pairs take away from them: of datasets
+    under one prompt, and of a dataset under both."""
     rows = results.cosines
     order = [*SHORT]
     place, other = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
@@ -203,12 +203,12 @@ _SIDES = (
 
 
 def _in_gaps(results: Results) -> list[Column]:
-    """The dose in units of the class gap of the direction's own dataset; the paper does not print its gaps."""
+    """Return the dose in units of the class gap of the direction's own dataset; the paper does not print its gaps."""
     return [Column("control_gaps", "in class gaps", "ratio", 2)] if results.is_study else []
 
 
 def _counts(results: Results) -> list[Column]:
-    """What stands behind a cell's two shares; the paper prints neither."""
+    """Return what stands behind a cell's two shares; the paper prints neither."""
     if not results.is_study:
         return []
     return [
@@ -218,12 +218,12 @@ def _counts(results: Results) -> list[Column]:
 
 
 def _cell_notes(results: Results) -> list[str]:
-    """How many answers a cell has at most, and what that says of all figures made of cells."""
+    """Return how many answers a cell has at most, and what that says of all figures made of cells."""
     counts = results.effects["n"].dropna()
     if not len(counts):
         return []
-    said = [f"n = {counts.max():.0f} answers per cell at most, one per scenario"]
-    return said + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
+    notes = [f"n = {counts.max():.0f} answers per cell at most, one per scenario"]
+    return notes + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
 
 
 def _named(rows: pd.DataFrame) -> pd.DataFrame:

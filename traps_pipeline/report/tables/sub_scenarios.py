@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Means over models of every occlusion sub-scenario, and the hidden ones compared with the others."""
+    """Return means over models of every occlusion sub-scenario, and the hidden ones compared with the others."""
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
     hidden = rows.iloc[:0]
@@ -46,7 +46,7 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Means over models of every chaotic family, and Acc by the control's answer."""
+    """Return means over models of every chaotic family, and Acc by the control's answer."""
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
     labels = titled(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])

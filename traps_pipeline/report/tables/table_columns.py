@@ -39,7 +39,7 @@ COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
 def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
-    """The items behind a number, by the row's model and regime, and by its dataset if it has one."""
+    """Return the items behind a number, by the row's model and regime, and by its dataset if it has one."""
     if field.startswith("published"):
         return None
     dataset = row.get("dataset")
@@ -48,19 +48,19 @@ def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
 
 
 def marked(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with `mark`: ‡ on incomplete rows, † on other rows with missing items."""
+    """Return the rows with `mark`: ‡ on incomplete rows, † on other rows with missing items."""
     incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
 
 
 def titled(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with `title`, the printed name of the dataset."""
+    """Return the rows with `title`, the printed name of the dataset."""
     return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
 
 def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """COUNTED for a comparison of entries: the fewest pairs and runs of any entry, the missing items of all."""
+    """Return COUNTED for a comparison of entries: the fewest pairs and runs of any entry, the missing items of all."""
     if not sides:
         return dict.fromkeys(COUNTED)
     counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
@@ -69,8 +69,8 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
-    """Rows that compare entries, `marked` and with COUNTED. sides: for each side, the columns of rows that hold its
-    model, regime and dataset; entries: cells, and those of the dataset `overall`."""
+    """Return rows that compare entries, `marked` and with COUNTED. sides: for each side, the columns of rows that hold
+    its model, regime and dataset; entries: cells, and those of the dataset `overall`."""
     import pandas as pd
 
     by_key = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
@@ -80,25 +80,25 @@ def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[
 
 
 def entries(results: Results) -> pd.DataFrame:
-    """The cells, followed by the overall rows with the dataset `overall`."""
+    """Return the cells, followed by the overall rows with the dataset `overall`."""
     import pandas as pd
 
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
 def marks(rows: pd.DataFrame) -> list[str]:
-    """The meanings of the marks in these rows."""
+    """Return the meanings of the marks in these rows."""
     return meanings(rows["mark"])
 
 
 def meanings(marks: Iterable[str]) -> list[str]:
-    """The meaning of each of these marks, once."""
+    """Return the meaning of each of these marks, once."""
     used = set(marks)
     return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used]
 
 
 def epochs(rows: pd.DataFrame) -> str:
-    """The note on epochs: it names the single epoch, or says how epochs are mixed; empty without rows."""
+    """Return the note on epochs: it names the single epoch, or says how epochs are mixed; empty without rows."""
     known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
     single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
     if len(single) <= 1:
@@ -115,18 +115,20 @@ def epochs(rows: pd.DataFrame) -> str:
 
 
 def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
-    """The columns to show: for a study all, for the paper's numbers those that the paper prints."""
-    whole = results.is_study or not len(rows)
-    return [c for c in columns if whole or c.field not in rows or not rows.loc[:, c.field].isna().all()]
+    """Return the columns to show: for a study all, for the paper's numbers those that the paper prints."""
+    is_complete = results.is_study or not len(rows)
+    return [c for c in columns if is_complete or c.field not in rows or not rows.loc[:, c.field].isna().all()]
 
 
 def best_first(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows by falling PECS, nulls last."""
+    """Return the rows by falling PECS, nulls last."""
     return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
 
 
 def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """The rows sorted by these columns; datasets and regimes in the benchmark's order, models in the registry's."""
+    """Return the rows sorted by these columns; datasets and regimes in the benchmark's order, models in the
+    registry's.
+    """
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
     def place(values: pd.Series) -> pd.Series:
@@ -137,13 +139,13 @@ def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 
 def interval(row: Mapping[str, Any]) -> str:
-    """The interval of PECS as printed; empty if there is none."""
+    """Return the interval of PECS as printed; empty if there is none."""
     low, high = row.get("pecs_ci_low"), row.get("pecs_ci_high")
     return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:
-    """The range of ranks that contrasts do not separate, as printed."""
+    """Return the range of ranks that contrasts do not separate, as printed."""
     import pandas as pd
 
     low, high = row.get("rank_low"), row.get("rank_high")
@@ -151,19 +153,19 @@ def ranks(row: Mapping[str, Any]) -> str:
 
 
 def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
-    """The rows as a frame; without rows, an empty frame with these columns."""
+    """Return the rows as a frame; without rows, an empty frame with these columns."""
     import pandas as pd
 
     return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
 
 
 def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
-    """The table; if it was run and has no rows, it prints its reason `why` instead of "not run"."""
+    """Return the table; if it was run and has no rows, it prints its reason `why` instead of "not run"."""
     return replace(table, none=table.why) if run and not len(table.rows) else table
 
 
 def no_overall(results: Results, replication: bool) -> str:
-    """Why there is no overall row."""
+    """Return why there is no overall row."""
     if replication:
         return "no model of the replication families has all four datasets"
     return "no model has all four datasets" if len(results.cells) else results.why("cells")

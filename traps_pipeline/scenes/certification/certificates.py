@@ -91,12 +91,12 @@ _NOISE_S = 1e-6  # far below a frame
 
 
 def earliest_cut(physics: Physics) -> int:
-    """The first admissible cut frame: its last shown frame, frame - 1, is at 1.0 s or later."""
+    """Return the first admissible cut frame: its last shown frame, frame - 1, is at 1.0 s or later."""
     return math.ceil(EARLIEST_CUT_S * physics.fps - 1e-9) + 1
 
 
 def least_entropy_bits(labels: int) -> float:
-    """The least entropy (bits) that a cut must leave open, by the number of answers that the question offers."""
+    """Return the least entropy (bits) that a cut must leave open, by the number of answers that the question offers."""
     return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
 
 
@@ -104,12 +104,12 @@ def least_entropy_bits(labels: int) -> float:
 
 
 def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
-    """The certificates of pairs with a kind of void, in order; if things are named, only those about them."""
+    """Return the certificates of pairs with a kind of void, in order; if things are named, only those about them."""
     return [c for c in CERTIFICATES if kind in c.kinds and (not about or c.about in about)]
 
 
 def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Pair:
-    """The pair of a record from its trajectories, each (F, nq); nothing of its evidence is read.
+    """Return the pair of a record from its trajectories, each (F, nq); nothing of its evidence is read.
 
     frame_step: pixel certificates look at every so many frames (1: full rate; 2: the 5 FPS sample).
     """
@@ -126,14 +126,14 @@ def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 
 def futures_of(control: World, seed: int, cut: int | None = None) -> ensemble.Futures:
-    """The futures of a control by which a cut is chosen, or, if it is chosen, certified."""
+    """Return the futures of a control by which a cut is chosen, or, if it is chosen, certified."""
     first = earliest_cut(control.physics) if cut is None else cut
     alike_px = MAX_DEVIATION_PX / fineness(control.params)
     return ensemble.Futures(control, seed, first=first, alike_px=alike_px, held_s=COMMITTED_BEFORE_END_S)
 
 
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
-    """The evidence that a record holds, and what it says of void and twin elsewhere."""
+    """Return the evidence that a record holds, and what it says of void and twin elsewhere."""
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
     physics = Physics(**spec.physics)
     evidence |= _closes(spec.closes_frame, physics)
@@ -181,7 +181,7 @@ OUTCOME = Certificate(
 
 
 def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
-    """The outcome of a trajectory, if it could be certified whatever it is. Raises Rejected."""
+    """Return the outcome of a trajectory, if it could be certified whatever it is. Raises Rejected."""
     outcome = read_outcome(family, motion, params)
     fps = 1.0 / float(motion.times[1] - motion.times[0])
     claim = Claim(family, float(motion.times[-1]), 0, outcome.label)
@@ -192,7 +192,7 @@ def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
 
 
 def settled_answer(world: World) -> str | None:
-    """What a world ends in; None if it ends in nothing that could be certified."""
+    """Return what a world ends in; None if it ends in nothing that could be certified."""
     try:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
@@ -325,7 +325,7 @@ IN_FRAME = Certificate(
 def legible_groups(
     family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
 ) -> list[tuple[tuple[str, ...], float]]:
-    """Groups of geoms that must be seen at the end of the control, each with its least number of pixels."""
+    """Return groups of geoms that must be seen at the end of the control, each with its least number of pixels."""
     if family.legible is not None:
         return list(family.legible(motion, params))
     return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]
@@ -399,7 +399,7 @@ ORDER = Certificate(
 
 
 def _first_hidden(pair: Pair) -> int:
-    """The first frame, of those looked at, from which the void hides what decides."""
+    """Return the first frame, of those looked at, from which the void hides what decides."""
     return -(-pair.void_from // pair.control.frame_step)
 
 
@@ -493,7 +493,7 @@ TWIN_BEHIND_PANEL = Certificate(
 
 
 def named_nouns(question: str, scene: Scene) -> list[str]:
-    """The nouns of a scene's inventory that a question names, in the order of the inventory."""
+    """Return the nouns of a scene's inventory that a question names, in the order of the inventory."""
     text = question.lower()
     return [noun for noun in scene.inventory.objects if re.search(rf"\b{noun}(s|es)?\b", text)]
 
@@ -539,7 +539,7 @@ def _referents(pair: Pair) -> Evidence:
 
 
 def _is_of(model: mujoco.MjModel, drawn: str, bodies: Collection[str]) -> bool:
-    """Whether a soft body, or a geom's body, is one of some bodies."""
+    """Return whether a soft body, or a geom's body, is one of some bodies."""
     return drawn in bodies if drawn in flexes(model) else model.body(int(model.geom(drawn).bodyid[0])).name in bodies
 
 
@@ -608,7 +608,7 @@ def _open(pair: Pair) -> Evidence:
 
 
 def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Evidence:
-    """What the state at a cut leaves open."""
+    """Return what the state at a cut leaves open."""
     counts = {label: n for label, n in futures.after(cut).items() if label is not None}
     settled = sum(counts.values())
     return {
@@ -781,8 +781,8 @@ CLOSING = Certificate(
 
 
 def _whole(world: World) -> World:
-    """A world of a record as it was before its clip was cut to a length: simulated here for as long as its family
-    says."""
+    """Return a world of a record as it was before its clip was cut to a length: simulated here for as long as its
+    family says."""
     physics = with_length(world.physics, world.family.physics.n_frames)
     if physics == world.physics:
         return world
@@ -790,7 +790,7 @@ def _whole(world: World) -> World:
 
 
 def _other_settings(pair: Pair) -> list[str]:
-    """Which settings of a pair its two worlds, in this order, do not give."""
+    """Return which settings of a pair its two worlds, in this order, do not give."""
     worlds, seed = (pair.control, pair.other_world), pair.claim.seed
     wholes = [_whole(world) for world in worlds]
     closing, found = pair.control.closing, []
@@ -921,7 +921,7 @@ CERTIFICATES = (
 
 
 def table() -> str:
-    """The certificates as the Markdown table of `docs/scenes.md`; a number in brackets depends on the OpenGL."""
+    """Return the certificates as the Markdown table of `docs/scenes.md`; a number in brackets depends on the OpenGL."""
     lines = ["| certificate | promises | does not promise | stored |", "| --- | --- | --- | --- |"]
     for certificate in CERTIFICATES:
         kinds = {"occluder": " (occlusion)", "truncation": " (chaotic)"}

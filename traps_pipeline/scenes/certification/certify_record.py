@@ -82,7 +82,7 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 
 def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
-    """Poses in the last frame that a cut void shows, and how they changed since the frame before, (2 nq,)."""
+    """Return poses in the last frame that a cut void shows, and how they changed since the frame before, (2 nq,)."""
     last, before = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
     return np.concatenate([last, last - before])
 
@@ -95,7 +95,7 @@ def _same_physics(pair: Pair) -> bool:
 
 
 def _last_frames(pair: Pair) -> tuple[str, str]:
-    """Digests of the last frame of the control and of the void."""
+    """Return digests of the last frame of the control and of the void."""
     control, last = pair.control, len(pair.control.qpos) - 1
     if control.panel is not None and control.closing is not None:
         (end,) = control.behind_panel([last])

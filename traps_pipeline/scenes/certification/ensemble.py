@@ -51,7 +51,7 @@ class Cut:
     perturbation: float
 
     def evidence(self) -> dict[str, Any]:
-        """The numbers behind the certificate `open`."""
+        """Return the numbers behind the certificate `open`."""
         return {name: value for name, value in vars(self).items() if name != "frame"}
 
 
@@ -70,7 +70,7 @@ class Rollout:
 
 
 def entropy_bits(counts: Mapping[str, int]) -> float:
-    """Shannon entropy (bits) of outcome counts; 0 for no outcome at all."""
+    """Return Shannon entropy (bits) of outcome counts; 0 for no outcome at all."""
     total = sum(counts.values())
     return sum(-n / total * math.log2(n / total) for n in counts.values() if n)
 
@@ -103,28 +103,30 @@ class Futures:
         self._after: dict[int, Counter[str | None]] = {}
 
     def batches(self) -> Iterator[list[Rollout]]:
-        """All rollouts so far after each batch of `BATCHES`."""
+        """Yield all rollouts so far after each batch of `BATCHES`."""
         for tried in BATCHES:
             if len(self._rollouts) < tried:
                 self._rollouts += self._simulated(range(len(self._rollouts), tried))
             yield self._rollouts[:tried]
 
     def start(self, number: int) -> np.ndarray:
-        """One of the starts, (nq,) float64: it follows from the seed and the control's first row. Raises Rejected if
-        there is none of that number."""
+        """Return one of the starts, (nq,) float64: it follows from the seed and the control's first row. Raises
+        Rejected if there is none of that number."""
         if not 0 <= number < TRIED:
             raise Rejected(f"there is no start {number}; there are {TRIED}")
         return self._prepared.starts[number]
 
     def rollout(self, number: int) -> Rollout:
-        """The future of one start, simulated here to its end. Raises Rejected if there is none of that number."""
+        """Return the future of one start, simulated here to its end. Raises Rejected if there is none of that
+        number.
+        """
         self.start(number)
         known = self._rollouts[number] if number < len(self._rollouts) else None
         return self._roll(number, whole=True) if known is None or known.qpos is None else known
 
     def after(self, cut: int) -> Counter[str | None]:
-        """How often the futures of the state in the last frame before a cut end in which outcome (None: undecided): of
-        AT_CUT states that differ from it by what no viewer resolves (UNSEEN_PX, READ_OVER_S)."""
+        """Return how often the futures of the state in the last frame before a cut end in which outcome (None:
+        undecided): of AT_CUT states that differ from it by what no viewer resolves (UNSEEN_PX, READ_OVER_S)."""
         if cut not in self._after:
             self._after[cut] = self._simulated_after(cut)
         return self._after[cut]
@@ -209,7 +211,7 @@ class Futures:
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
-    """What a cut at one frame leaves open."""
+    """Return what a cut at one frame leaves open."""
     alike = [r for r in rollouts if r.parted >= frame]
     counts = Counter(r.label for r in alike if r.label is not None)
     accepted = counts.total()
@@ -218,12 +220,13 @@ def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
 
 
 def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
-    """The first accepted rollout at a cut that ends otherwise than the truth: the same clip, another answer."""
+    """Return the first accepted rollout at a cut that ends otherwise than the truth: the same clip, another answer."""
     return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
 def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: np.ndarray) -> float:
-    """The furthest (px) that any corner or outline point of a moving body is from its place in the other trajectory."""
+    """Return the furthest (px) that any corner or outline point of a moving body is from its place in the other
+    trajectory."""
     import mujoco
 
     silhouette, placed = _Silhouette(model, camera), mujoco.MjData(model)
@@ -232,7 +235,7 @@ def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: 
 
 
 def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, seed: int) -> np.ndarray:
-    """TRIED starts, shape (TRIED, nq): a normal step of one scale (m, rad) on every degree of freedom."""
+    """Return TRIED starts, shape (TRIED, nq): a normal step of one scale (m, rad) on every degree of freedom."""
     import mujoco
 
     steps = np.random.default_rng([seed, TRIED]).normal(scale=scale, size=(TRIED, model.nv))
@@ -263,7 +266,8 @@ def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> 
 
 
 def along_contacts(model: mujoco.MjModel, data: mujoco.MjData, step: np.ndarray) -> np.ndarray:
-    """A step (nv,) without the parts that push free bodies into, or off, what they touch: these would hit or drop."""
+    """Return a step (nv,) without the parts that push free bodies into, or off, what they touch: these would hit or
+    drop."""
     normals: dict[int, list[np.ndarray]] = {}
     for contact in data.contact[: data.ncon]:
         for geom in contact.geom:
@@ -299,8 +303,8 @@ class _Silhouette:
         self._outline = model.geom_size[self._balls, :1, None] * outline
 
     def pixels(self, qpos: np.ndarray, data: mujoco.MjData) -> np.ndarray:
-        """Pixel coordinates of all outline points in one pose, shape (N, 2). data: where it is computed, of the model;
-        its own for each thread, and made once, since making it takes longer than all else here."""
+        """Return pixel coordinates of all outline points in one pose, shape (N, 2). data: where it is computed, of the
+        model; its own for each thread, and made once, since making it takes longer than all else here."""
         import mujoco
 
         data.qpos[:] = qpos

@@ -42,7 +42,7 @@ class Claim:
 
     @staticmethod
     def of_record(spec: SceneSpec) -> Claim:
-        """What a record claims."""
+        """Return what a record claims."""
         physics = Physics(**spec.physics)
         return Claim(
             family=get_family(spec.family),
@@ -105,11 +105,13 @@ class Number:
     of_futures: bool = False
 
     def stored(self, value: Any) -> Any:
-        """The value as a record has it."""
+        """Return the value as a record has it."""
         return value if self.decimals is None else round(value, self.decimals)
 
     def is_stored(self, value: Any, stored: Any, *, exact: bool) -> bool:
-        """Whether a value measured again is the stored one; if not exact, to one unit of the last stored digit."""
+        """Return whether a value measured again is the stored one; if not exact, to one unit of the last stored
+        digit.
+        """
         if exact or self.decimals is None:
             return self.stored(value) == stored
         return abs(self.stored(value) - stored) < 1.5 * 10**-self.decimals
@@ -136,21 +138,21 @@ class Certificate:
     kinds: tuple[VoidKind, ...] = ("occluder", "truncation")
 
     def measured(self, pair: Pair) -> Evidence:
-        """The evidence. Raises Rejected if there is none in this pair."""
+        """Return the evidence. Raises Rejected if there is none in this pair."""
         evidence = self.measure(pair)
         if list(evidence) != [number.name for number in self.numbers]:
             raise TypeError(f"certificate {self.name}: measures {list(evidence)}, not what its `numbers` say")
         return evidence
 
     def failure(self, evidence: Evidence, claim: Claim) -> str | None:
-        """Why the certificate cannot be given by some evidence, None if it can."""
+        """Return why the certificate cannot be given by some evidence, None if it can."""
         try:
             return next(self.judge(evidence, claim), None)
         except KeyError as missing:
             return f"no evidence {missing}"
 
     def contradiction(self, evidence: Evidence, stored: Evidence, *, exact: bool) -> str | None:
-        """How evidence that was measured again contradicts what a record has stored, None if it does not.
+        """Return how evidence that was measured again contradicts what a record has stored, None if it does not.
 
         exact: this machine's arithmetic is that of the one which stored it, so that not even the last digit may differ.
         """
@@ -166,12 +168,12 @@ class Certificate:
         return None
 
     def kept(self, evidence: Evidence) -> dict[str, Any]:
-        """What a record stores of the evidence."""
+        """Return what a record stores of the evidence."""
         return {n.name: n.stored(evidence[n.name]) for n in self.numbers if n.kept and n.name in evidence}
 
 
 def required(certificates: Iterable[Certificate], pair: Pair, so_far: Evidence) -> dict[str, Any]:
-    """All evidence once these are measured too. Raises Rejected with the first failure."""
+    """Return all evidence once these are measured too. Raises Rejected with the first failure."""
     evidence = dict(so_far)
     for certificate in certificates:
         evidence |= certificate.measured(pair)

@@ -25,9 +25,9 @@ from traps_pipeline.scenes.worlds.world import World
 
 
 def closed(pair: Pair, seed: int, so_far: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
-    """A pair whose control closes, at a moment that follows from the seed, with the evidence of it; the pair as it is
-    if its control can be closed at no moment that is tried. so_far: the evidence of all other certificates. Raises
-    Rejected if not even that can be certified."""
+    """Return a pair whose control closes, at a moment that follows from the seed, with the evidence of it; the pair as
+    it is if its control can be closed at no moment that is tried. so_far: the evidence of all other certificates.
+    Raises Rejected if not even that can be certified."""
     worlds = pair.control, pair.other_world
     for frame in moments(worlds[:1] if pair.control.panel is None else worlds, seed):
         try:
@@ -38,7 +38,7 @@ def closed(pair: Pair, seed: int, so_far: Mapping[str, Any]) -> tuple[Pair, dict
 
 
 def _certified(pair: Pair, closing: Closing | None, so_far: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
-    """A pair whose control ends like this, with all evidence. Raises Rejected."""
+    """Return a pair whose control ends like this, with all evidence. Raises Rejected."""
     control, twin = replace(pair.control, closing=closing), replace(pair.other_world, closing=closing)
     ending = replace(pair, control=control, twin=twin)
     kind: VoidKind = "truncation" if control.panel is None else "occluder"
@@ -47,7 +47,7 @@ def _certified(pair: Pair, closing: Closing | None, so_far: Mapping[str, Any]) -
 
 
 def record_of(pair: Pair) -> dict[str, Any] | None:
-    """How the control closes, as a record has it."""
+    """Return how the control closes, as a record has it."""
     closing = pair.control.closing
     if closing is None:
         return None
@@ -56,8 +56,8 @@ def record_of(pair: Pair) -> dict[str, Any] | None:
 
 
 def panel_from(frame: int, control: World, *others: World) -> Panel:
-    """The panel that closes a control at a frame: that of its void, or one in front of where all outcomes lie and of
-    all that moves from then on, in the control and in other worlds that it must not be told from."""
+    """Return the panel that closes a control at a frame: that of its void, or one in front of where all outcomes lie
+    and of all that moves from then on, in the control and in other worlds that it must not be told from."""
     if control.panel is not None:
         return control.panel
     zone = control.scene.framed if control.scene.rest is None else (control.scene.rest,)

@@ -15,8 +15,9 @@ NEAR_SHARE = 0.1  # of a family's records may have another one that looks like t
 
 
 def perceptual_hash(frame: np.ndarray) -> int:
-    """64 bits: which of the 8 x 8 lowest cosine frequencies of the 32 x 32 grey picture lie above their median. frame:
-    (H, W, 3) RGB. The pHash of Zauner, Implementation and Benchmarking of Perceptual Image Hash Functions, 2010."""
+    """Return 64 bits: which of the 8 x 8 lowest cosine frequencies of the 32 x 32 grey picture lie above their median.
+    frame: (H, W, 3) RGB. The pHash of Zauner, Implementation and Benchmarking of Perceptual Image Hash Functions, 2010.
+    """
     import cv2  # here, since the graph imports the sampler, and nothing heavy
 
     grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (32, 32), interpolation=cv2.INTER_AREA)
@@ -25,7 +26,7 @@ def perceptual_hash(frame: np.ndarray) -> int:
 
 
 def first_look(spec: SceneSpec, qpos: np.ndarray) -> int:
-    """The hash of the first frame of a record's clip. qpos: its trajectory, (F, nq)."""
+    """Return the hash of the first frame of a record's clip. qpos: its trajectory, (F, nq)."""
     with World.of_record(spec, qpos).closed_renderer() as renderer:
         (first,) = renderer.frames(qpos[:1])
     return perceptual_hash(first)
@@ -42,6 +43,8 @@ def alike(looks: Mapping[str, int]) -> dict[str, str]:
 
 
 def too_alike(looks: Mapping[str, int], new: int, wanted: int) -> str | None:
-    """The record that a new hash looks like, if with it more than NEAR_SHARE of the `wanted` have such another."""
+    """Return the record that a new hash looks like, if with it more than NEAR_SHARE of the `wanted` have such
+    another.
+    """
     pairs = alike({**looks, "new": new})
     return pairs.get("new") if len(pairs) > NEAR_SHARE * wanted else None

@@ -115,7 +115,7 @@ def _rewritten(
 
 
 def _drawn_again(job: _Job) -> Resolved | str:
-    """What the draw of a record gives today, under the record's names, or why it is rejected."""
+    """Return what the draw of a record gives today, under the record's names, or why it is rejected."""
     spec, _, seed = job
     found = try_draw(Draw(spec.family, seed, spec.seed, frozenset(), tuple(sorted(get_family(spec.family).looks))))
     if isinstance(found, str):
@@ -128,7 +128,7 @@ def _drawn_again(job: _Job) -> Resolved | str:
 
 
 def _relooked(job: _Job) -> Resolved | str:
-    """A record with the look of its draw, or which certificate it loses under it."""
+    """Return a record with the look of its draw, or which certificate it loses under it."""
     spec, folder, seed = job
     family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"
     look = look_of_draw(seed, spec.family, spec.seed, sorted(family.looks))
@@ -139,8 +139,8 @@ def _relooked(job: _Job) -> Resolved | str:
 
 
 def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
-    """A record under a look that moves neither camera nor panel, or which certificate it loses; those of rollouts stay.
-    qpos, twin: its trajectories, (F, nq) each."""
+    """Return a record under a look that moves neither camera nor panel, or which certificate it loses; those of
+    rollouts stay. qpos, twin: its trajectories, (F, nq) each."""
     family = get_family(spec.family)
     dressed = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
     other = spec.twin.params

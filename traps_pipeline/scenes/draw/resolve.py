@@ -55,7 +55,7 @@ def resolve(
     seed: int,
     physics: Physics | None = None,
 ) -> Resolved:
-    """The record of a scenario with its trajectories. Raises Rejected when it makes no valid pair."""
+    """Return the record of a scenario with its trajectories. Raises Rejected when it makes no valid pair."""
     physics = physics or family.physics
     whole = _control(family, params, physics)
     answer = whole.outcome.label
@@ -101,8 +101,8 @@ def resolve(
 def _of_some_length(
     whole: World, kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """The pair of a simulated control, with all its evidence, of the first other world and the first length for which
-    it has all certificates. Raises Rejected if there is none."""
+    """Return the pair of a simulated control, with all its evidence, of the first other world and the first length for
+    which it has all certificates. Raises Rejected if there is none."""
     rejected = Rejected("no other hidden element gives another outcome")
     for worlds in [(whole,)] if kind == "truncation" else _with_others(whole):
         for n_frames in lengths(worlds, seed):
@@ -123,7 +123,7 @@ def _of_some_length(
 
 
 def _control(family: Family, params: Any, physics: Physics) -> World:
-    """The control of a draw: simulated, and with its camera and panel fitted to itself."""
+    """Return the control of a draw: simulated, and with its camera and panel fitted to itself."""
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
     camera, panel = fit_shot(scene.view, shown_points(model, scene, qpos), scene.cover)
@@ -133,8 +133,8 @@ def _control(family: Family, params: Any, physics: Physics) -> World:
 def _first_certified(
     candidates: Iterable[Pair], kind: VoidKind, seed: int, so_far: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """The first of some pairs, which differ in their panel, whose void and twin are certified and whose control can
-    end. Raises Rejected if none is."""
+    """Return the first of some pairs, which differ in their panel, whose void and twin are certified and whose control
+    can end. Raises Rejected if none is."""
     rejected = Rejected("there is no twin")
     for pair in candidates:
         try:
@@ -153,7 +153,8 @@ def _with_twin(pair: Pair, frame: int | None, twin: World) -> Pair:
 
 
 def _with_others(control: World) -> Iterator[tuple[World, World]]:
-    """The control with each world that has another hidden element and another settled outcome, seen by one camera."""
+    """Yield the control with each world that has another hidden element and another settled outcome, seen by one
+    camera."""
     family, physics = control.family, control.physics
     assert family.twins is not None, f"{family.name}: an occlusion family needs twins"
     for params in family.twins(control.params):
@@ -171,7 +172,7 @@ def _with_others(control: World) -> Iterator[tuple[World, World]]:
 
 
 def _cut_short(pair: Pair) -> list[Pair]:
-    """The pair with the latest cut that leaves its outcome open, and a future of that cut as its twin."""
+    """Return the pair with the latest cut that leaves its outcome open, and a future of that cut as its twin."""
     found = choose_cut(pair.futures, pair.claim, pair.control.outcome.commit_frame)
     if found is None:
         raise Rejected("no cut at 1.0 s or later leaves the outcome open")
@@ -182,8 +183,8 @@ def _cut_short(pair: Pair) -> list[Pair]:
 
 
 def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, Rollout] | None:
-    """The latest cut, not too early and not after commitment, that leaves the outcome open, and a twin: the first
-    rollout that looks like the control up to there and ends otherwise. None if there is no such cut."""
+    """Return the latest cut, not too early and not after commitment, that leaves the outcome open, and a twin: the
+    first rollout that looks like the control up to there and ends otherwise. None if there is no such cut."""
     if commit_frame < futures.first:
         return None
     for rollouts in futures.batches():
@@ -198,20 +199,21 @@ def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, 
 
 
 def open_cuts(rollouts: Sequence[Rollout], frames: range, claim: Claim) -> Iterator[Cut]:
-    """The cuts at which the futures of many starts leave the outcome open, latest first."""
+    """Return the cuts at which the futures of many starts leave the outcome open, latest first."""
     cuts = (ensemble.at_cut(rollouts, frame, claim.family.perturbation) for frame in reversed(frames))
     return (cut for cut in cuts if OPEN.failure(cut.evidence(), claim) is None)
 
 
 def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
-    """Whether hardly any scout looks like the control at the earliest cut, or nearly all of them end alike."""
+    """Return whether hardly any scout looks like the control at the earliest cut, or nearly all of them end alike."""
     counts = Counter(r.label for r in scouts if r.parted >= first and r.label is not None)
     few = counts.total() < len(scouts) * MIN_ACCEPTED / ensemble.TRIED / 2
     return few or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
 
 
 def plain(value: Any) -> Any:
-    """Tuples to lists, numpy numbers to Python's, so that a record equals itself after a round trip through JSON."""
+    """Return tuples to lists, numpy numbers to Python's, so that a record equals itself after a round trip through
+    JSON."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

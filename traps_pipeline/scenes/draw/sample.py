@@ -53,7 +53,7 @@ class Tally:
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
-    """Family to how its records were drawn, from `draws.json` beside them."""
+    """Return family to how its records were drawn, from `draws.json` beside them."""
     path = released / DRAWS
     if not path.is_file():
         return {}
@@ -62,7 +62,7 @@ def load_tallies(released: Path) -> dict[str, Tally]:
 
 
 def answer_quota(count: int, n_labels: float) -> int:
-    """How often one answer may occur among `count` scenarios of a family.
+    """Return how often one answer may occur among `count` scenarios of a family.
 
     Under ten: once more than the even split, rounded up. Else 60 % of two answers, 1.5 times the fair share of more.
     """
@@ -72,7 +72,7 @@ def answer_quota(count: int, n_labels: float) -> int:
 
 
 def ill_posed_quota(taxonomy: str, count: int) -> int:
-    """How often one ill-posed text may occur: once in an occlusion family, in 5 % of a chaotic one."""
+    """Return how often one ill-posed text may occur: once in an occlusion family, in 5 % of a chaotic one."""
     return 1 if taxonomy == "occlusion" else max(1, count // 20)
 
 
@@ -159,7 +159,7 @@ def sample_family(
 
 
 def kind_of(reason: str) -> str:
-    """What a rejection has in common with others: its reason without what was measured, and without details."""
+    """Return what a rejection has in common with others: its reason without what was measured, and without details."""
     return _MEASURED.sub("", reason.split(":")[0])
 
 
@@ -178,7 +178,7 @@ class Records:
             old.unlink()
 
     def read(self, tally: Tally) -> list[SceneSpec]:
-        """The records of the draws that the tally counts; a record after them was cut off and is dropped."""
+        """Return the records of the draws that the tally counts; a record after them was cut off and is dropped."""
         if not self._lines.is_file():
             return []
         specs = []
@@ -192,7 +192,7 @@ class Records:
         return kept
 
     def qpos(self, spec: SceneSpec) -> np.ndarray:
-        """The trajectory of a record that was read."""
+        """Return the trajectory of a record that was read."""
         return load_trajectory(self._released / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
 
     def sort(self) -> None:
@@ -232,7 +232,7 @@ def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
 
 
 def record_line(spec: SceneSpec) -> str:
-    """A record as its file has it."""
+    """Return a record as its file has it."""
     return json.dumps(spec.model_dump(mode="json"), ensure_ascii=False) + "\n"
 
 
@@ -256,7 +256,7 @@ def _choices(family: Family) -> Mapping[str, float]:
 
 
 def try_draw(draw: Draw) -> Resolved | str:
-    """A draw, resolved, or why it is rejected."""
+    """Return a draw, resolved, or why it is rejected."""
     family = get_family(draw.family)
     rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
     params = family.draw(rng)
@@ -272,7 +272,7 @@ def try_draw(draw: Draw) -> Resolved | str:
 
 
 def _named(family: Family, found: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
-    """The scenario with its id and an ill-posed question that its family still has room for."""
+    """Return the scenario with its id and an ill-posed question that its family still has room for."""
     named = found.spec.model_copy(update={"scenario_id": f"{family.name}-{place:04d}"})
     question = ill_posed_for(named, draw.seed, texts, count)
     return Resolved(named.model_copy(update={"ill_posed_question": question}), found.qpos, found.twin)
@@ -289,7 +289,9 @@ def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -
 
 
 def simulated_answer(family: Family, params: Any) -> str:
-    """What the control of a draw shows: a second's work, so that a draw without a place costs no certificates."""
+    """Return what the control of a draw shows: a second's work, so that a draw without a place costs no
+    certificates.
+    """
     model, scene = compile_scene(family, params, family.physics)
     qpos = simulated(model, scene, family.physics)
     outcome = settled_outcome(family, replay(model, qpos, family.physics), params)

@@ -21,8 +21,8 @@ MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the oth
 
 
 def trimmed(pair: Pair) -> Iterator[Pair]:
-    """The pair behind one panel after another, the smallest first: cut to what its twin needs with the one margin and
-    with the other, and as it is. Each may still lose a certificate. The pair must have a panel, a twin and an
+    """Yield the pair behind one panel after another, the smallest first: cut to what its twin needs with the one margin
+    and with the other, and as it is. Each may still lose a certificate. The pair must have a panel, a twin and an
     outcome."""
     panel = pair.control.panel
     assert panel is not None, "only a panel can be trimmed"
@@ -34,8 +34,8 @@ def trimmed(pair: Pair) -> Iterator[Pair]:
 
 
 def must_hide(pair: Pair) -> np.ndarray:
-    """The pixels of a 480x360 frame that a panel must cover, (H, W) bool, found without any panel; the same if the two
-    worlds are exchanged."""
+    """Return the pixels of a 480x360 frame that a panel must cover, (H, W) bool, found without any panel; the same if
+    the two worlds are exchanged."""
     needed, drawn = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
         until = max(world.outcome.commit_frame - 1, 0)
@@ -49,8 +49,8 @@ def must_hide(pair: Pair) -> np.ndarray:
 
 
 def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> Panel:
-    """The least upright panel in a panel's plane, and within it, that covers some pixels (H, W) and so many around
-    them; the panel as it is if there are none."""
+    """Return the least upright panel in a panel's plane, and within it, that covers some pixels (H, W) and so many
+    around them; the panel as it is if there are none."""
     rows, columns = np.nonzero(needed)
     if not len(rows):
         return panel
@@ -69,7 +69,7 @@ def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> 
 
 
 def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.ndarray:
-    """Where any frame differs from its other one, on the grid of 480x360."""
+    """Return where any frame differs from its other one, on the grid of 480x360."""
     found = np.zeros((HEIGHT, WIDTH), bool)
     for frame, other in zip(frames, others, strict=True):
         unlike = (frame != other).any(axis=2)
@@ -79,13 +79,13 @@ def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.nd
 
 
 def _directions(panel: Panel) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors of a panel: away from the camera, and to the camera's right."""
+    """Return unit vectors of a panel: away from the camera, and to the camera's right."""
     azimuth = np.radians(panel.yaw_deg + 90.0)
     return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
 
 
 def _on_plane(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
-    """Where the lines of sight through pixels (N, 2) meet the upright plane so far ahead, (N, 3)."""
+    """Return where the lines of sight through pixels (N, 2) meet the upright plane so far ahead, (N, 3)."""
     right, up, forward = camera.axes()
     focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
     sideways, upwards = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal

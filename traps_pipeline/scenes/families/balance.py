@@ -64,7 +64,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Shelf and beam before a board that carries the beam and catches the shadows."""
+    """Return shelf and beam before a board that carries the beam and catches the shadows."""
     course = Course(physics, p.direction)
     r, side = p.radius_m, 1.7 * p.radius_m
     sin, cos = np.sin(np.radians(p.tilt_deg)), np.cos(np.radians(p.tilt_deg))
@@ -102,7 +102,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_beam(course: Course, p: Params) -> None:
-    """The beam with cup and counterweight, on a hinge; it starts at the stop to which the counterweight pulls."""
+    """Add the beam with cup and counterweight, on a hinge; it starts at the stop to which the counterweight pulls."""
     d, half = p.direction, p.direction * float(np.radians(p.tilt_deg)) / 2
     low, high = sorted((-2 * d * p.tilt_deg, 0.0))
     body = course.hinge("beam", (0, 0, p.pivot_z_m), damping=0.5, range_deg=(low, high))
@@ -124,8 +124,9 @@ def _add_beam(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The lower end, or 'balanced', from when the ball lies in the cup. A ball that misses the cup has no reading. The
-    margin is how far the height difference of the beam's ends is from the one that parts tipped from balanced."""
+    """Return the lower end, or 'balanced', from when the ball lies in the cup. A ball that misses the cup has no
+    reading. The margin is how far the height difference of the beam's ends is from the one that parts tipped from
+    balanced."""
     turn = motion.rot("beam")
     ball = np.einsum("fji,fj->fi", turn, motion.pos("ball") - motion.pos("beam"))  # as the beam sees it
     cup = np.array([-p.direction * p.arm_m, 0.0, BEAM_HALF_M + p.radius_m])
@@ -144,8 +145,8 @@ def _three(p: Params, rng: np.random.Generator) -> Filled:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The slope of the beam against that of the black base below it, in the last frames; None while the beam is not
-    to be seen."""
+    """Return the slope of the beam against that of the black base below it, in the last frames; None while the beam is
+    not to be seen."""
     slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames[-3:]]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < len(slopes) or max(tilts) - min(tilts) > TIPPED_DEG:
@@ -155,8 +156,8 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """A beam that turns as far over as it leaned at first, or does not turn at all, stays at that end; one that slows
-    down in between comes to rest level."""
+    """Return a beam that turns as far over as it leaned at first, or does not turn at all, stays at that end; one that
+    slows down in between comes to rest level."""
     slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < 3 or abs(tilts[0]) < TIPPED_DEG:
@@ -168,7 +169,8 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _slope_deg(frame: np.ndarray, colour: str, min_area: int) -> float | None:
-    """Slope of the largest region of a colour, positive if it falls to the right; None unless it is a long strip."""
+    """Return slope of the largest region of a colour, positive if it falls to the right; None unless it is a long
+    strip."""
     blob = largest(frame, colour, min_area)
     if blob is None or blob.box[2] < 80:
         return None

@@ -38,7 +38,7 @@ PLAIN = shuffled("wood", "grey", "white", "black", without="wall_colour")
 
 
 def _windows(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
-    """The first window is at the same share of the wall; the second one varies."""
+    """Return the first window is at the same share of the wall; the second one varies."""
     wall_m = so_far["wall_m"]
     return round(0.30 * wall_m, 4), round(wall_m * uniform(rng, 0.70, 0.76), 4)
 
@@ -69,7 +69,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A lane, a wall with windows and merlons before it, a tray at its end."""
+    """Return a lane, a wall with windows and merlons before it, a tray at its end."""
     course = Course(physics, p.direction)
     r, rail, front = p.radius_m, 0.012, -1.35 * p.radius_m - WALL_M
     side, far = 1.25 * r, p.wall_m + p.tray_m
@@ -105,7 +105,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_wall(course: Course, p: Params, across: Span) -> None:
-    """The wall around its two windows, with merlons on top."""
+    """Add the wall around its two windows, with merlons on top."""
     lintel = SILL_M + 0.62 * (p.height_m - SILL_M)
     edges = [0.0, *(at + s * p.window_m / 2 for at in p.windows_m for s in (-1, 1)), p.wall_m]
     course.block("wall_foot", (0, p.wall_m), across, (0, SILL_M), p.wall_colour)
@@ -119,7 +119,7 @@ def _add_wall(course: Course, p: Params, across: Span) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Whether the ball is wholly past the wall, or stays where it is behind it."""
+    """Return whether the ball is wholly past the wall, or stays where it is behind it."""
     return came_through(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.wall_m, p.radius_m)
 
 

@@ -55,7 +55,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A table, then pad, wall and tray before a board that catches the shadows."""
+    """Return a table, then pad, wall and tray before a board that catches the shadows."""
     course = Course(physics, p.direction)
     r, side, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
     near, far, end = p.wall_at_m - WALL_HALF_M, p.wall_at_m + WALL_HALF_M, p.wall_at_m + p.tray_m

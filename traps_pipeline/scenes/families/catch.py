@@ -85,7 +85,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Pedestal, pen with a back wall and a low front, basket."""
+    """Return pedestal, pen with a back wall and a low front, basket."""
     course = Course(physics, p.direction, Surface(0.004, solref=SOFT))
     r, rim, deep, colour = p.radius_m, p.rim_m, (-DEPTH_M, DEPTH_M), p.pen_colour
     course.block("pedestal", (-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m), p.pedestal_colour)
@@ -129,8 +129,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the ball is all but down on a floor between the basket's sides, 'no' when it is beside the basket;
-    None while it is higher. The margin is how far its centre ends from the nearest side of the basket."""
+    """Return 'yes' while the ball is all but down on a floor between the basket's sides, 'no' when it is beside the
+    basket; None while it is higher. The margin is how far its centre ends from the nearest side of the basket."""
     ball = motion.pos("ball")
     along = p.direction * ball[:, 0]
     inside = p.basket_half_m - np.abs(along - p.basket_m)
@@ -139,7 +139,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the resting ball is between the sides of the basket in the picture."""
+    """Return whether the resting ball is between the sides of the basket in the picture."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     sides, ball = _sides(frames[-1], named["basket"]), end_of(path)
     if ball is None or sides is None:
@@ -148,7 +148,8 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the flying ball is between the sides of the basket when it has fallen to the middle of their height."""
+    """Return whether the flying ball is between the sides of the basket when it has fallen to the middle of their
+    height."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     sides, flight = _sides(frames[-1], named["basket"]), [ball for ball in path if ball is not None]
     if sides is None or len(flight) < 3:
@@ -162,7 +163,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] | None:
-    """The left and the right end, the top and the bottom (px) of all that has the basket's colour."""
+    """Return the left and the right end, the top and the bottom (px) of all that has the basket's colour."""
     boxes = [part.box for part in blobs(colour_mask(frame, colour), 40)]
     if not boxes:
         return None

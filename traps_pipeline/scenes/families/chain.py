@@ -72,7 +72,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Ramp, step, deck with the row between low rims, sunken box."""
+    """Return ramp, step, deck with the row between low rims, sunken box."""
     course = Course(physics, p.direction)
     r, side, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
     deep, outer = (-side, side), (-side - WALL_M, side + WALL_M)
@@ -113,8 +113,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the middle of the last ball is in the box; 'no' while it is not, from when all balls are as good as
-    at rest. The margin is how far it ends inside the box by its middle, or short of it by its front."""
+    """Return 'yes' while the middle of the last ball is in the box; 'no' while it is not, from when all balls are as
+    good as at rest. The margin is how far it ends inside the box by its middle, or short of it by its front."""
     along = {ball: p.direction * motion.pos(ball)[:, 0] for ball in ("striker", *p.balls)}
     ahead = along["last"] - p.box_at_m
     still = still_from(*along.values(), within_m=STILL_M)

@@ -54,12 +54,14 @@ class Params:
     elevation_deg: float = between(-44, -39)
 
     def bodies(self, side: str) -> list[str]:
-        """The dominoes of a branch, from the junction on."""
+        """Return the dominoes of a branch, from the junction on."""
         return [*(f"{side}_{i}" for i in range(self.branch - 1)), f"end_{side}"]
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """The row runs along -y from the first domino at the origin; the branches start where the kicked ball stops."""
+    """Return the row runs along -y from the first domino at the origin; the branches start where the kicked ball
+    stops.
+    """
     course, h = Course(physics), p.height_m
     face = (p.visible - 1) * p.spacing + p.thickness / 2
     junction = face + STOP_AT
@@ -99,7 +101,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: float) -> None:
-    """The dominoes of a branch, one of which may lie beside it, on the inner side."""
+    """Add the dominoes of a branch, one of which may lie beside it, on the inner side."""
     ahead, inwards = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
     colours = [p.row_colour] * (p.branch - 1) + [p.left_colour if side == "left" else p.right_colour]
@@ -113,7 +115,9 @@ def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: floa
 def _add_domino(
     course: Course, p: Params, name: str, at: np.ndarray, yaw: float, colour: str, *, lying: bool = False
 ) -> None:
-    """A free domino (body and geom `name`) at (across, along), its thickness along a direction `yaw` from the row."""
+    """Add a free domino (body and geom `name`) at (across, along), its thickness along a direction `yaw` from the
+    row.
+    """
     h = p.height_m
     deep, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
     place = (float(at[0]) * h, -float(at[1]) * h, (PLANK + high / 2) * h)
@@ -123,7 +127,7 @@ def _add_domino(
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The side on which alone the end domino's top is below half a domino's height, from when no domino of the
+    """Return the side on which alone the end domino's top is below half a domino's height, from when no domino of the
     branches moves any more. The margin is how far either top ends from that height, at least."""
     tops = np.stack([top_m(motion, f"end_{side}", p.height_m) for side in SIDES], axis=1) - PLANK * p.height_m
     still = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
@@ -143,7 +147,7 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The side whose end domino alone is no longer where it stood at first."""
+    """Return the side whose end domino alone is no longer where it stood at first."""
     stands = [_stands(frames, named[side]) for side in SIDES]
     if None in stands or stands[0] == stands[1]:
         return None
@@ -151,7 +155,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The side whose end domino alone has left its place or is about to; a flag of its colour does neither."""
+    """Return the side whose end domino alone has left its place or is about to; a flag of its colour does neither."""
     falls = []
     for colour in (named["left"], named["right"]):
         seen = blobs(colour_mask(frames[0], colour), 60)
@@ -160,7 +164,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The side whose end domino rests and is the flatter of the two."""
+    """Return the side whose end domino rests and is the flatter of the two."""
     ends = [end_of(track(frames, named[side], 60)) for side in SIDES]
     upright = [end.box[3] / end.box[2] for end in ends if end is not None]
     if len(upright) < 2 or max(upright) < FLATTER * min(upright):
@@ -169,7 +173,8 @@ def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _stands(frames: np.ndarray, colour: str) -> bool | None:
-    """Whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the end."""
+    """Return whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the
+    end."""
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
     if first is None or last is None or is_panel(first) or is_panel(last):
         return None

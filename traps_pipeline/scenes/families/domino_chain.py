@@ -64,7 +64,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Both parts of the row on a plank, a ball before each, posts that stop the second ball."""
+    """Return both parts of the row on a plank, a ball before each, posts that stop the second ball."""
     course = Course(physics, p.direction)
     colours = [p.row_colour] * (p.concealed - 1) + [p.last_colour]
     second = [
@@ -96,8 +96,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' from when the top of the last domino is below half a domino's height; 'no' while it is not, from when no
-    concealed domino moves any more. The margin is how far that top ends from half a domino's height."""
+    """Return 'yes' from when the top of the last domino is below half a domino's height; 'no' while it is not, from
+    when no concealed domino moves any more. The margin is how far that top ends from half a domino's height."""
     top = top_m(motion, "last", p.height_m, dominoes.PLANK * p.height_m)
     still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
     return Reading(yes_while(top < p.height_m / 2, still), float(abs(top[-1] - p.height_m / 2)))

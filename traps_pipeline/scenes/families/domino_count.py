@@ -42,7 +42,7 @@ def _ranges(rng: np.random.Generator, so_far: Drawn) -> Ranges:
 
 
 def _gap_after(rng: np.random.Generator, so_far: Drawn) -> int:
-    """Any place for which that choice is right."""
+    """Return any place for which that choice is right."""
     low, high = so_far["right"]
     return int(rng.integers(low, high + 1))
 
@@ -79,7 +79,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Both rows on a plank, a ball before each, posts that stop the second ball."""
+    """Return both rows on a plank, a ball before each, posts that stop the second ball."""
     course = Course(physics, p.direction)
     places = [i if i < p.gap_after else i + 1 for i in range(len(p.second))]
     along = dominoes.add_rows(
@@ -110,14 +110,14 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def twins(p: Params) -> list[Params]:
-    """The same rows with the gap where another choice is right."""
+    """Return the same rows with the gap where another choice is right."""
     right, places = range_of(p.ranges, p.gap_after), range(1, len(p.second) + 1)
     return [replace(p, gap_after=n) for n in places if range_of(p.ranges, n) != right]
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The choice for how many tops are below 0.6 of a domino's height, from when none of the second row moves. The
-    margin is how far any top ends from that height, at least."""
+    """Return the choice for how many tops are below 0.6 of a domino's height, from when none of the second row moves.
+    The margin is how far any top ends from that height, at least."""
     tops = np.stack([top_m(motion, body, p.height_m) for body in p.second], axis=1) - dominoes.PLANK * p.height_m
     fallen = (tops < FALLEN * p.height_m).sum(axis=1)
     still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
@@ -126,7 +126,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """All dominoes of the second row less those that still stand where they stood at first."""
+    """Return all dominoes of the second row less those that still stand where they stood at first."""
     colour = named["second"]
     before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
     standing = blobs(before, min_area=60)
@@ -137,7 +137,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The dominoes of the second row that no longer stand where they stood, or that something moves at."""
+    """Return the dominoes of the second row that no longer stand where they stood, or that something moves at."""
     standing, change = blobs(colour_mask(frames[0], named["second"]), min_area=60), moved(frames)
     ranges = _choices(named, len(standing))
     if ranges is None:
@@ -150,7 +150,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The dominoes of the second row, of which the choices tell the number, less those that stand at the end."""
+    """Return the dominoes of the second row, of which the choices tell the number, less those that stand at the end."""
     close, after = (colour_mask(frames[i], named["second"]) for i in (-3, -1))
     if "choices" not in named or not after.any() or (after != close).sum() > 0.1 * after.sum():
         return None
@@ -160,7 +160,9 @@ def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _choices(named: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:
-    """The ranges that are offered, or those that are for so many dominoes; None if these are not all of the row."""
+    """Return the ranges that are offered, or those that are for so many dominoes; None if these are not all of the
+    row.
+    """
     if "choices" in named:
         offered: Sequence[Sequence[int]] = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
         return offered if offered[-1][1] == dominoes_seen else None

@@ -61,12 +61,12 @@ class Params:
 
 
 def twins(p: Params) -> list[Params]:
-    """The same drop with the ridge on the other side of it."""
+    """Return the same drop with the ridge on the other side of it."""
     return [replace(p, offset_m=-p.offset_m)]
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Bins with a high back and a low front, the ridge of two boards that lean together, a cube to one side."""
+    """Return bins with a high back and a low front, the ridge of two boards that lean together, a cube to one side."""
     course = Course(physics, surface=FELT)
     r, end, high = p.radius_m, p.bin_m, p.ridge_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -113,15 +113,15 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The side of the ridge that the ball is on while its centre is lower than the ridge; None while it is higher. The
-    margin is how far its centre ends from the middle of the ridge."""
+    """Return the side of the ridge that the ball is on while its centre is lower than the ridge; None while it is
+    higher. The margin is how far its centre ends from the middle of the ridge."""
     ball = motion.pos("ball")
     past = ball[:, 0] - p.offset_m
     return Reading(side_while(ball[:, 2] < p.ridge_m, past, "right", "left"), float(abs(past[-1])))
 
 
 def _one_colour(part: str, question: str) -> Aside:
-    """A question after the colour of ball or cube; a third choice is one that neither has."""
+    """Return a question after the colour of ball or cube; a third choice is one that neither has."""
 
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         colours = [p.ball_colour, p.cube_colour]
@@ -132,13 +132,13 @@ def _one_colour(part: str, question: str) -> Aside:
 
 
 def _middle_x(frame: np.ndarray, colour: str) -> float | None:
-    """The middle (px) of all that has a colour; None if there is little of it."""
+    """Return the middle (px) of all that has a colour; None if there is little of it."""
     columns = np.flatnonzero(colour_mask(frame, colour).sum(axis=0) >= 4)
     return float(columns[0] + columns[-1]) / 2 if len(columns) >= 15 else None
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the resting ball is nearer to the middle of what is red or of what is blue."""
+    """Return whether the resting ball is nearer to the middle of what is red or of what is blue."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     ball, red, blue = path[-1], _middle_x(frames[-1], "red"), _middle_x(frames[-1], "blue")
     if ball is None or not at_rest(path) or red is None or blue is None:
@@ -147,8 +147,8 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The side of the ridge's top on which the ball comes down. The top is halfway between the edges that fall to the
-    left and those that fall to the right; the ball meets it about half a frame later."""
+    """Return the side of the ridge's top on which the ball comes down. The top is halfway between the edges that fall
+    to the left and those that fall to the right; the ball meets it about half a frame later."""
     ball = carried_on([rounded(frame, named["ball"]) for frame in frames], 0.5)
     red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
     bins = [largest(frames[0], colour) for colour in ("red", "blue")]

@@ -31,7 +31,7 @@ SEEN = ("ball", "shelf", "cup")
 
 
 def _throats(rng: np.random.Generator, so_far: Drawn) -> list[float]:
-    """A throat that is wider than the ball and one that is narrower, in random order."""
+    """Return a throat that is wider than the ball and one that is narrower, in random order."""
     throats = [uniform(rng, 1.3, 1.5), uniform(rng, 0.55, 0.75)]
     return throats if rng.integers(2) == 0 else throats[::-1]
 
@@ -65,12 +65,13 @@ class Params:
 
 
 def twins(p: Params) -> list[Params]:
-    """The same funnel with the other throat."""
+    """Return the same funnel with the other throat."""
     return [replace(p, half_throat=p.other_half_throat, other_half_throat=p.half_throat)]
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Shelf on two legs, cup, funnel before a back wall. Lengths run along the roll, from the middle of the funnel."""
+    """Return shelf on two legs, cup, funnel before a back wall. Lengths run along the roll, from the middle of the
+    funnel."""
     course = Course(physics, p.direction, Surface(0.003, sliding=0.5, solref=SOFT))
     r, half, slope, deep = p.radius_m, p.cup_half_m, radians(p.slope_deg), (-DEPTH_M, DEPTH_M)
     mouth = p.throat_at_m + p.board_m * sin(slope)  # height of the funnel's upper edges
@@ -122,8 +123,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the ball is wholly below the throat and over the cup, if it ends there; 'no' while it is where it
-    ends between the boards. The margin is how far it ends from being just through the throat, or how much too narrow
+    """Return 'yes' while the ball is wholly below the throat and over the cup, if it ends there; 'no' while it is where
+    it ends between the boards. The margin is how far it ends from being just through the throat, or how much too narrow
     the throat is for it."""
     ball = motion.pos("ball")
     height = ball[:, 2] - p.throat_at_m
@@ -138,7 +139,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the resting ball, of which the boards may hide a part, is below the upper edge of the cup."""
+    """Return whether the resting ball, of which the boards may hide a part, is below the upper edge of the cup."""
     path = [rounded(frame, named["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
     ball, cup = path[-1], largest(frames[-1], named["cup"], 150)
     if ball is None or not at_rest(path) or cup is None:

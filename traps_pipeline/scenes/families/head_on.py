@@ -55,7 +55,9 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Two ramps, steps, and a deck with a centre line and low rims. The boards are alike but for their friction."""
+    """Return two ramps, steps, and a deck with a centre line and low rims. The boards are alike but for their
+    friction.
+    """
     course = Course(physics)
     r, half, side, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
     deep, on_deck, board_at = (-side, side), (0, DECK_M), half - 0.10
@@ -87,20 +89,20 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _roughness(p: Params) -> float:
-    """Rolling friction (m) that leaves a ball its share of its speed: a solid ball slows at 5 g mu / 7 r."""
+    """Return rolling friction (m) that leaves a ball its share of its speed: a solid ball slows at 5 g mu / 7 r."""
     drop = (p.ramp_m - sum(p.starts_m) / 2) * np.tan(np.radians(p.slope_deg)) * 10 / 7
     return float(7 / 5 * p.radius_m * drop * (1 - p.slowed**2) / (2 * BOARD_M))
 
 
 def _on_ramp(p: Params, along: float, over: float = 0.0) -> Vec3:
-    """The place so far from the foot of a ramp, and from the surface there so far out of it."""
+    """Return the place so far from the foot of a ramp, and from the surface there so far out of it."""
     slope = np.radians(p.slope_deg)
     high = DECK_M + STEP_M + along * np.tan(slope)
     return float(p.half_deck_m + along - over * np.sin(slope)), 0.0, float(high + over * np.cos(slope))
 
 
 def _add_ramp(course: Course, p: Params, name: str, side: float) -> None:
-    """The ramp of one side, and the prop under its upper end."""
+    """Add the ramp of one side, and the prop under its upper end."""
     slope, half_thick = float(np.radians(p.slope_deg)), 0.012
     half = (p.ramp_m / 2 / float(np.cos(slope)), side, half_thick)
     course.slab(f"ramp_{name}", _on_ramp(p, p.ramp_m / 2, -half_thick), half, p.ramp_colour, falls_rad=-slope)
@@ -122,7 +124,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """Of one ball, which is drawn first: its side or its colour."""
+    """Return of one ball, which is drawn first: its side or its colour."""
     i = int(rng.integers(2))
     if rng.integers(2):
         question = f"On which ramp does the {p.colours[i]} ball start, the left one or the right one?"
@@ -133,7 +135,7 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """The ball that ends on its own side of the black line, if both are at rest on that side."""
+    """Return the ball that ends on its own side of the black line, if both are at rest on that side."""
     line, kept = largest(frames[0], "black"), []
     for colour in colours_of_balls(frames, named, BALL_COLOURS):
         path = track(frames, colour, 60)

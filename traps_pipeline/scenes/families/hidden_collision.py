@@ -56,7 +56,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A flat track with rails; of each lane the end is closed by which no ball enters."""
+    """Return a flat track with rails; of each lane the end is closed by which no ball enters."""
     course = Course(physics, p.direction)
     r, half, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
     end, switch_at, length = half + p.run_m, -half + p.switch_m, float(np.hypot(*SWITCH)) * r
@@ -92,7 +92,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_switch(course: Course, p: Params, at: float, length: float) -> None:
-    """The switch board: in line with the rails, or across the first ball's lane."""
+    """Add the switch board: in line with the rails, or across the first ball's lane."""
     across, along = SWITCH[0] * p.radius_m, SWITCH[1] * p.radius_m
     x, y = (at + along / 2, p.lanes[0] * across / 2) if p.turned else (at + length / 2, 0.0)
     yaw = -p.direction * p.lanes[0] * float(np.arctan2(across, along)) if p.turned else 0.0
@@ -103,8 +103,8 @@ def _add_switch(course: Course, p: Params, at: float, length: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'no' from when the balls have passed each other; 'yes' from when they are closest, if they touch. The margin is
-    how far apart they end along the track."""
+    """Return 'no' from when the balls have passed each other; 'yes' from when they are closest, if they touch. The
+    margin is how far apart they end along the track."""
     between_them = motion.pos("ball_1") - motion.pos("ball_0")
     ahead = p.direction * between_them[:, 0]  # of the second ball on the first one's way
     distance = np.linalg.norm(between_them, axis=1)
@@ -115,13 +115,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _either_order(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
-    """The two colours, in random order."""
+    """Return the two colours, in random order."""
     first, second = (str(c) for c in rng.permutation(p.colours))
     return {"first": first, "second": second}
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """The side or the lane of one ball, which is drawn whatever is asked, or whether the lanes are the same."""
+    """Return the side or the lane of one ball, which is drawn whatever is asked, or whether the lanes are the same."""
     kind, i = rng.integers(3), int(rng.integers(2))
     if kind == 0:
         question = f"From which side does the {p.colours[i]} ball roll in, left or right?"
@@ -134,8 +134,8 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """'no' once the balls are in the other order from left to right than they start in; 'yes' if they come to rest
-    without that."""
+    """Return 'no' once the balls are in the other order from left to right than they start in; 'yes' if they come to
+    rest without that."""
     starts, ends, resting = [], [], True
     for name in ("first", "second"):
         path = [small(frame, named[name]) for frame in frames]
@@ -151,7 +151,8 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the balls, if they go on as they do, are in one lane when they are side by side: then they collide."""
+    """Return whether the balls, if they go on as they do, are in one lane when they are side by side: then they
+    collide."""
     paths = [[small(frame, named[name]) for frame in frames] for name in ("first", "second")]
     a, b = (carried_on(path, 0.0) for path in paths)
     a_next, b_next = (carried_on(path, 1.0) for path in paths)
@@ -169,7 +170,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _along(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
-    """Which way the track runs in the picture: the balls start at its ends."""
+    """Return which way the track runs in the picture: the balls start at its ends."""
     first, second = (next((blob for blob in path if blob), None) for path in paths)
     if first is None or second is None:
         return None

@@ -54,7 +54,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Track on a post, chute, tilting plate on a partition, one bin on each side of it, board at the back.
+    """Return track on a post, chute, tilting plate on a partition, one bin on each side of it, board at the back.
 
     Only track, post, chute and ball are mirrored by `direction`; bins and board are left and right in the picture.
     """
@@ -112,15 +112,17 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The side of the bin in which the ball is, while it is below the bins' outer walls. The margin is how far it ends
-    from the partition."""
+    """Return the side of the bin in which the ball is, while it is below the bins' outer walls. The margin is how far
+    it ends from the partition."""
     ball = motion.pos("ball")
     x = ball[:, 0]
     return Reading(side_while(ball[:, 2] < p.rim_m + p.radius_m, x, "right", "left"), float(abs(x[-1]) - p.radius_m))
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The side that the plate above the middle of the bins falls to, by the slopes of its edges in the picture."""
+    """Return the side that the plate above the middle of the bins falls to, by the slopes of its edges in the
+    picture.
+    """
     left, right = (largest(frames[0], named[side], 60) for side in ("left", "right"))
     if left is None or right is None or left.x > right.x:
         return None

@@ -79,7 +79,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Deck with rails, opaque tunnel, sunken tray. Lengths run along the lanes."""
+    """Return deck with rails, opaque tunnel, sunken tray. Lengths run along the lanes."""
     course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
@@ -120,19 +120,19 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _roughness(p: Params, lane: int, physics: Physics) -> float:
-    """Rolling friction (m) that brings this lane's ball down to `creep_m_s`."""
+    """Return rolling friction (m) that brings this lane's ball down to `creep_m_s`."""
     lost = (ARRIVING * p.speeds_m_s[lane]) ** 2 - p.creep_m_s**2
     return brake(p.radius_m, lost, ROUGH_BOARD_M, physics)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The colour that came out first, from when its ball is wholly out."""
+    """Return the colour that came out first, from when its ball is wholly out."""
     along = [p.direction * motion.pos(ball)[:, 0] for ball in p.balls]
     return first_past(motion, np.stack(along, axis=1) - p.radius_m - p.exit_m, p.colours, MIN_LEAD_S)
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The ball that is seen again first after it was out of sight, once all of them are."""
+    """Return the ball that is seen again first after it was out of sight, once all of them are."""
     colours = colours_of_balls(frames, named, BALL_COLOURS)
     out = [_seen_again(frames, colour) for colour in colours]
     seen = [frame for frame in out if frame is not None]
@@ -142,7 +142,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _seen_again(frames: np.ndarray, colour: str) -> int | None:
-    """First frame that shows at least half of the ball after the tunnel, None if it stays out of sight."""
+    """Return first frame that shows at least half of the ball after the tunnel, None if it stays out of sight."""
     areas = np.array([_ball_pixels(frame, colour) for frame in frames])
     gone = np.flatnonzero(areas == 0)
     if not gone.size or areas[-3:].min() == 0:
@@ -157,7 +157,7 @@ def _ball_pixels(frame: np.ndarray, colour: str) -> int:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The ball that is the first to be seen again, be it a part of it."""
+    """Return the ball that is the first to be seen again, be it a part of it."""
     back: dict[str, int] = {}
     for colour in colours_of_balls(frames, named, BALL_COLOURS):
         gone = [at for at, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]

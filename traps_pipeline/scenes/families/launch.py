@@ -64,7 +64,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Ledge, slide, kicker, pit, barrier and tray before a board that catches the shadows."""
+    """Return ledge, slide, kicker, pit, barrier and tray before a board that catches the shadows."""
     course = Course(physics, p.direction)
     r, side, rim = p.radius_m, 1.6 * p.radius_m, 0.012
     (_, top), (lip, lip_z) = p.way[0], p.way[-1]

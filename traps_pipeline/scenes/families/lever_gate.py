@@ -58,7 +58,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A lane with a step before a board that carries the lever and catches the shadows."""
+    """Return a lane with a step before a board that carries the lever and catches the shadows."""
     course = Course(physics, p.direction)
     r, side, rim, top, (pivot, pivot_z) = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + STEP_M, p.pivot_m
     end = p.gate_at_m + 2 * p.arm_m + p.tail_m
@@ -90,7 +90,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_lever(course: Course, p: Params, side: float) -> None:
-    """The lever with gate and counterweight, at rest where the counterweight holds it."""
+    """Add the lever with gate and counterweight, at rest where the counterweight holds it."""
     start, d = p.swing_deg if p.held_open else 0.0, p.direction
     low, high = sorted((d * -start, d * (p.swing_deg - start)))
     body = course.hinge("lever", (p.pivot_m[0], 0, p.pivot_m[1]), damping=0.05, range_deg=(low, high))
@@ -105,8 +105,8 @@ def _add_lever(course: Course, p: Params, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' from when the ball is wholly past the gate; 'no' while it is not, from when it lies within a centimetre of
-    its last place. The margin is how far its rear ends from the gate."""
+    """Return 'yes' from when the ball is wholly past the gate; 'no' while it is not, from when it lies within a
+    centimetre of its last place. The margin is how far its rear ends from the gate."""
     along = motion.pos("ball")[:, 0]
     past = p.direction * along - p.gate_at_m - GATE_HALF_M - p.radius_m
     return Reading(yes_while(past > 0, still_from(along, within_m=0.01)), float(abs(past[-1])))

@@ -53,7 +53,7 @@ LABELS = ("0", "1", "2", "3")
 
 
 def _sides(rng: np.random.Generator, so_far: Drawn) -> tuple[int, ...]:
-    """All from one side, or one of them from the other; then how far each has to roll."""
+    """Return all from one side, or one of them from the other; then how far each has to roll."""
     side = int(rng.choice([-1, 1]))
     sides = (side,) * BALLS if rng.random() < 0.5 else (side, -side, side)
     ways, gap = {-1: uniform(rng, 0.21, 0.28), 1: uniform(rng, 0.21, 0.28)}, uniform(rng, 0.120, 0.150)
@@ -62,7 +62,9 @@ def _sides(rng: np.random.Generator, so_far: Drawn) -> tuple[int, ...]:
 
 
 def _zones(rng: np.random.Generator, so_far: Drawn) -> tuple[Any, ...]:
-    """Widths of two or three zones that meet below where the balls fall, their colours, and which is asked for."""
+    """Return widths of two or three zones that meet below where the balls fall, their colours, and which is asked
+    for.
+    """
     zones, width = int(rng.integers(2, 4)), uniform(rng, 1.10, 1.25)
     sides = so_far["sides"]
     fall = sides[0] * (width / 2 - 0.52) if len(set(sides)) == 1 else 0.0  # about where the balls fall
@@ -134,16 +136,16 @@ class Params:
         return self.lip_m + rise + 3 * self.ball_radius_m
 
     def shelf_m(self, side: int) -> float:
-        """Length of the shelf at a side."""
+        """Return length of the shelf at a side."""
         return max(w for w, s in zip(self.ways_m, self.sides, strict=True) if s == side) + 1.4 * self.ball_radius_m
 
     def lip_x_m(self, side: int) -> float:
-        """Where the upper face of a shelf ends, across the board."""
+        """Return where the upper face of a shelf ends, across the board."""
         return side * (self.width_m / 2 - self.shelf_m(side) * math.cos(self.slope_rad))
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Plate, frame, zones with walls between them, pegs, shelves, balls."""
+    """Return plate, frame, zones with walls between them, pegs, shelves, balls."""
     board = Board(
         physics,
         tilt_deg=p.tilt_deg,
@@ -180,7 +182,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_shelf(board: Board, p: Params, side: int) -> None:
-    """A shelf from a side wall down towards the middle, as thick as a wall."""
+    """Add a shelf from a side wall down towards the middle, as thick as a wall."""
     slope, half = p.slope_rad, p.shelf_m(side) / 2
     centre = (
         p.lip_x_m(side) + side * (half * math.cos(slope) + WALL_M * math.sin(slope)),
@@ -192,15 +194,15 @@ def _add_shelf(board: Board, p: Params, side: int) -> None:
 
 
 def _start(p: Params, ball: int) -> tuple[float, float]:
-    """Where a ball's centre starts: across and up the board (m). It rests against its shelf."""
+    """Return where a ball's centre starts: across and up the board (m). It rests against its shelf."""
     side, way, slope = p.sides[ball], p.ways_m[ball], p.slope_rad
     across = way * math.cos(slope) - p.ball_radius_m * math.sin(slope)
     return p.lip_x_m(side) + side * across, p.lip_m + way * math.sin(slope) + p.ball_radius_m * math.cos(slope)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """How many balls' centres are in the asked zone, while all are in some zone; None before. The margin is how far the
-    nearest ball's centre ends from the walls of the asked zone or from the zones' rim."""
+    """Return how many balls' centres are in the asked zone, while all are in some zone; None before. The margin is how
+    far the nearest ball's centre ends from the walls of the asked zone or from the zones' rim."""
     places = [place(motion, f"ball_{i}", p.tilt_deg) for i in range(BALLS)]
     across, up = (np.stack(values, axis=1) for values in zip(*places, strict=True))
     low, high = p.edges_m[p.asked : p.asked + 2]
@@ -211,7 +213,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _counts(p: Params, rng: np.random.Generator) -> Filled:
-    """The choices are all counts that three balls allow."""
+    """Return the choices are all counts that three balls allow."""
     aliases = {"all three": "3", "all three balls": "3"}
     for label, number in zip(LABELS, NUMBERS, strict=False):
         noun = "ball" if label == "1" else "balls"
@@ -236,7 +238,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
-    """Colour of the zone that a ball is above, seen along the board; None while it has many pegs before it."""
+    """Return colour of the zone that a ball is above, seen along the board; None while it has many pegs before it."""
     outlines = {colour: ground[:, 0].astype(float) for colour, ground in grounds.items() if ground is not None}
     if len(outlines) < 2:
         return None
@@ -252,7 +254,7 @@ def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
 
 
 def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
-    """Convex outline of a zone's colour, which balls may part into regions; None if it has not a zone's size."""
+    """Return convex outline of a zone's colour, which balls may part into regions; None if it has not a zone's size."""
     mask = colour_mask(frame, colour).astype(np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     regions = [outline for outline in outlines if cv2.contourArea(outline) > 40]
@@ -262,7 +264,7 @@ def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
 
 
 def _home(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
-    """Colour of the zone that a ball's centre lies in."""
+    """Return colour of the zone that a ball's centre lies in."""
     inside = (c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0)
     return next(inside, None)
 

@@ -76,7 +76,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A raised lane, then floor and block before a board that carries pendulum and peg."""
+    """Return a raised lane, then floor and block before a board that carries pendulum and peg."""
     course = Course(physics, p.direction)
     r, side, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
     deep, top = (-side, side), FLOOR_M + p.lane_m
@@ -114,7 +114,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_pendulum(course: Course, p: Params, side: float) -> None:
-    """A bob on a rod that hangs from an axle in the board and swings along the way."""
+    """Add a bob on a rod that hangs from an axle in the board and swings along the way."""
     import mujoco
 
     body = course.hinge("pendulum", (p.pivot_at_m, 0, p.pivot_z_m), damping=0.02)
@@ -127,8 +127,8 @@ def _add_pendulum(course: Course, p: Params, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' from when the block's top is below half the block's height; 'no' while it is not, from when the pendulum
-    has swung out farthest and comes back. The margin is how far that top ends from half the height."""
+    """Return 'yes' from when the block's top is below half the block's height; 'no' while it is not, from when the
+    pendulum has swung out farthest and comes back. The margin is how far that top ends from half the height."""
     top = top_m(motion, "block", p.block_height_m, FLOOR_M)
     swing = -p.direction * motion.rot("pendulum")[:, 0, 2]
     fallen = top < p.block_height_m / 2
@@ -136,7 +136,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The block is tall and narrow at the end, or it lies flat; None while it is not to be seen."""
+    """Return the block is tall and narrow at the end, or it lies flat; None while it is not to be seen."""
     seen = [largest(frame, named["block"], 80) for frame in frames[-3:]]
     shapes = [blob.box[3] / blob.box[2] for blob in seen if blob is not None]
     if len(shapes) < 3 or largest(frames[-1], named["bob"], 80) is None:
@@ -145,7 +145,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the block has begun to give way, or the bob swings against it if it goes on as it does."""
+    """Return whether the block has begun to give way, or the bob swings against it if it goes on as it does."""
     first, last = largest(frames[0], named["block"], 80), largest(frames[-1], named["block"], 80)
     bob = carried_on(track(frames, named["bob"], 80), AHEAD)
     if first is None or last is None or bob is None:

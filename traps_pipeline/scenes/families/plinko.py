@@ -48,7 +48,7 @@ def _tilt(rng: np.random.Generator, so_far: Drawn) -> float:
 
 
 def _balls(rng: np.random.Generator, so_far: Drawn) -> tuple[Any, ...]:
-    """Colours, starts, pushes towards the other side, rises."""
+    """Return colours, starts, pushes towards the other side, rises."""
     sides = so_far["sides"]
     colours = distinct_colours(rng, len(sides), SCHEMES[so_far["board_colour"]])
     starts = tuple(round(float(side * rng.uniform(0.12, 0.40)), 4) for side in sides)
@@ -98,7 +98,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Plate, numbered apron, frame, buckets, pegs, balls."""
+    """Return plate, numbered apron, frame, buckets, pegs, balls."""
     board = Board(
         physics,
         tilt_deg=p.tilt_deg,
@@ -134,7 +134,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_digit(board: Board, digit: int, x: float) -> None:
-    """A seven-segment digit on the apron, drawn only."""
+    """Add a seven-segment digit on the apron, drawn only."""
     half, pen = 0.024, 0.007  # half the digit's width, half a stroke
     low, mid, high = 0.025, 0.07, 0.115
     strokes = {
@@ -152,8 +152,8 @@ def _add_digit(board: Board, digit: int, x: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The number of the bucket that the asked ball's centre is in; None above the buckets. The margin is how far that
-    centre ends from where another bucket begins: its walls or their rim."""
+    """Return the number of the bucket that the asked ball's centre is in; None above the buckets. The margin is how far
+    that centre ends from where another bucket begins: its walls or their rim."""
     middle, up = place(motion, "ball_0", p.tilt_deg)
     across = middle + p.width_m / 2
     bucket = np.clip(across // p.pitch_m, 0, p.buckets - 1).astype(int) + 1
@@ -163,7 +163,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _numbers(p: Params, rng: np.random.Generator) -> Filled:
-    """The choices are the buckets' numbers."""
+    """Return the choices are the buckets' numbers."""
     labels = tuple(str(i + 1) for i in range(p.buckets))
     aliases: dict[str, str] = {}
     for n, word, ordinal in zip(labels, NUMBERS[1:], ORDINALS, strict=False):
@@ -180,8 +180,8 @@ FRAME = 0.012  # share of that edge below the frame at either side
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The bucket that the ball is above by its share of the apron's lower edge, if it lies there or will soon: of those
-    that two rows of pegs leave to it, the one right below is the likeliest."""
+    """Return the bucket that the ball is above by its share of the apron's lower edge, if it lies there or will soon:
+    of those that two rows of pegs leave to it, the one right below is the likeliest."""
     last = frames[-1]
     if not any(named["ball"] in pool for pool in SCHEMES.values()):
         return None
@@ -199,7 +199,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
-    """How many digits stand on the apron: one a bucket. Beside each there is a gap without ink."""
+    """Return how many digits stand on the apron: one a bucket. Beside each there is a gap without ink."""
     left, right = edge
     along = right - left
     up = np.array([along[1], -along[0]])
@@ -213,7 +213,7 @@ def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
 
 
 def _lower_edge(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """The lower left and right corner of the white apron: no white is lower."""
+    """Return the lower left and right corner of the white apron: no white is lower."""
     outlines, _ = cv2.findContours((frame.min(axis=2) > 225).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     large = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
     if not large:

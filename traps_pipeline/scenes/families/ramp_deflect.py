@@ -50,7 +50,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Table with a front and a back wall, deflector, a bin at either side, ramp behind."""
+    """Return table with a front and a back wall, deflector, a bin at either side, ramp behind."""
     course = Course(physics)
     r, top, wide, rim, side = p.radius_m, p.table_m, p.half_width_m, p.table_m + 1.1 * p.radius_m, 1.5 * p.radius_m
 
@@ -95,7 +95,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_bin(course: Course, p: Params, name: str, sign: int, colour: str) -> None:
-    """An open box beside the table (sign -1: on the left), lower than it."""
+    """Add an open box beside the table (sign -1: on the left), lower than it."""
     near, far = p.half_width_m, p.half_width_m + p.bin_m
     middle, half, depth = sign * (near + far) / 2, p.bin_m / 2, p.depth_m / 2
     course.slab(f"bin_{name}", (middle, depth, 0.006), (half, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
@@ -107,8 +107,8 @@ def _add_bin(course: Course, p: Params, name: str, sign: int, colour: str) -> No
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'left' or 'right' from when the ball is past that end of the table. The margin is how far its middle ends past
-    that end."""
+    """Return 'left' or 'right' from when the ball is past that end of the table. The margin is how far its middle ends
+    past that end."""
     x = motion.pos("ball")[:, 0]
     past = np.abs(x) - p.half_width_m
     return Reading(side_while(past > 0, x, "right", "left"), float(past[-1]))

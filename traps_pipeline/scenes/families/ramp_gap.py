@@ -60,7 +60,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Ramp with rails and support, deck in two parts with the gap between them, box."""
+    """Return ramp with rails and support, deck in two parts with the gap between them, box."""
     course = Course(physics, p.direction)
     r, side, gap, end = p.radius_m, 1.7 * p.radius_m, p.gap_span, p.deck_end_m + p.box_m
     deep, deck, box = (-side, side), (0, p.deck_m), (p.deck_end_m, end)
@@ -100,8 +100,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' from when the ball is past the end of the deck, 'no' from when it is half its radius down in the gap. The
-    margin is how far it ends past the deck, or below it."""
+    """Return 'yes' from when the ball is past the end of the deck, 'no' from when it is half its radius down in the
+    gap. The margin is how far it ends past the deck, or below it."""
     ball = motion.pos("ball")
     past, sunk = p.direction * ball[:, 0] - p.deck_end_m, p.deck_m + p.radius_m - ball[:, 2]
     labels = ["yes" if x > 0 else "no" if z > 0.5 * p.radius_m else None for x, z in zip(past, sunk, strict=True)]

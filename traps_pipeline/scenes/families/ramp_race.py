@@ -40,12 +40,12 @@ def _tray_colour(rng: np.random.Generator, so_far: Drawn) -> str:
 
 
 def _track_colours(rng: np.random.Generator, so_far: Drawn) -> tuple[str, str]:
-    """The same for both tracks, or one each."""
+    """Return the same for both tracks, or one each."""
     return so_far["first"], so_far["first" if rng.integers(2) else "second"]
 
 
 def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
-    """One near the top of its ramp, the other lower, either on the left."""
+    """Return one near the top of its ramp, the other lower, either on the left."""
     top, lower = so_far["ramp_m"] - 0.07, uniform(rng, 0.08, 0.13)
     high, low = round(top, 4), round(top - lower, 4)
     return (low, high) if rng.integers(2) else (high, low)
@@ -74,7 +74,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Two tracks that run to the front, each behind a ramp of its own, and one tray before both."""
+    """Return two tracks that run to the front, each behind a ramp of its own, and one tray before both."""
     course = Course(physics)
     r, side, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
     rough = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
@@ -124,7 +124,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _roughness(p: Params, track: int, physics: Physics) -> float:
-    """Rolling friction (m) that brings this track's ball down to `creep_m_s`.
+    """Return rolling friction (m) that brings this track's ball down to `creep_m_s`.
 
     Before, it has kept its spin and the part of its velocity along the track at the foot of the ramp.
     """
@@ -135,13 +135,13 @@ def _roughness(p: Params, track: int, physics: Physics) -> float:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The colour that came into the tray first, from when the middle of its ball is past the edge."""
+    """Return the colour that came into the tray first, from when the middle of its ball is past the edge."""
     ahead = p.tray_m - np.stack([motion.pos(ball)[:, 1] for ball in BALLS], axis=1)
     return first_past(motion, ahead, p.colours, MIN_LEAD_S)
 
 
 def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """Which ball starts higher up, or which is on one of the ramps."""
+    """Return which ball starts higher up, or which is on one of the ramps."""
     choices = tuple(str(c) for c in rng.permutation(p.colours))
     if rng.integers(2):
         higher = p.colours[int(np.argmax(p.starts_m))]
@@ -155,7 +155,7 @@ SETTLING_PX = 8.0  # so far a ball may still roll in the tray when a panel comes
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Which ball is first near the place where it rests in the end: the same part of the tray for both."""
+    """Return which ball is first near the place where it rests in the end: the same part of the tray for both."""
     choices = colours_of_balls(frames, named, BALL_COLOURS)
     paths = [[compact(frame, colour) for frame in frames] for colour in choices]
     if len(choices) != 2 or not all(at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
@@ -166,7 +166,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Which ball will be lower in the picture, nearer to the tray, if both gain speed as they do."""
+    """Return which ball will be lower in the picture, nearer to the tray, if both gain speed as they do."""
     lower: dict[str, float] = {}
     for colour in colours_of_balls(frames, named, BALL_COLOURS):
         path = [compact(frame, colour) for frame in frames[-3:]]
@@ -178,7 +178,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _progress(path: list[Blob | None]) -> np.ndarray:
-    """How far a ball is from where it was seen first, frame by frame."""
+    """Return how far a ball is from where it was seen first, frame by frame."""
     first = next(ball for ball in path if ball is not None)
     return np.array([0.0 if ball is None else np.hypot(ball.x - first.x, ball.y - first.y) for ball in path])
 

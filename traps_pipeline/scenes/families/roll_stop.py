@@ -63,7 +63,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Track with kerbs, patch, two lines and end wall."""
+    """Return track with kerbs, patch, two lines and end wall."""
     course = Course(physics, p.direction)
     r, side, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
     deep, outer, track = (-side, side), (-side - WALL_M, side + WALL_M), (0, TRACK_M)
@@ -96,8 +96,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the middle of the ball is past the far edge of the line; 'no' while it is not, from when it moves no
-    more. The margin is how far it ends from the line."""
+    """Return 'yes' while the middle of the ball is past the far edge of the line; 'no' while it is not, from when it
+    moves no more. The margin is how far it ends from the line."""
     past = p.direction * motion.pos("ball")[:, 0] - p.line_m - LINE_M / 2
     return Reading(yes_while(past > 0, still_from(past, within_m=STILL_M)), clear_m(past, LINE_M))
 

@@ -75,7 +75,7 @@ def _tilt(rng: np.random.Generator, so_far: Drawn) -> float:
 
 
 def _beam_colour(rng: np.random.Generator, so_far: Drawn) -> str:
-    """One that stands out against the board and the ball."""
+    """Return one that stands out against the board and the ball."""
     ball, beams = so_far["ball_colour"], BEAMS[so_far["board_colour"]]
     return str(rng.choice([beam for beam in beams if (ball, beam) not in CLASHES]))
 
@@ -97,7 +97,7 @@ def _rise(rng: np.random.Generator, so_far: Drawn) -> float:
 
 
 def _bands(rng: np.random.Generator, so_far: Drawn) -> tuple[float, ...]:
-    """Two bands, or none."""
+    """Return two bands, or none."""
     so_far["half_m"] = so_far["bin_m"] + sum(so_far["trays_m"]) / 2
     if so_far["bands"] == "none":
         return ()
@@ -107,7 +107,8 @@ def _bands(rng: np.random.Generator, so_far: Drawn) -> tuple[float, ...]:
 
 
 def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
-    """Boxes that stand beside the board, at most one on either side: how far across and away, half width and height."""
+    """Return boxes that stand beside the board, at most one on either side: how far across and away, half width and
+    height."""
     crates: list[tuple[float, ...]] = []
     for side in (-1, 1):
         if rng.random() < 0.6:
@@ -174,7 +175,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Plate, frame, bins and trays with walls between them, seesaw, pegs, ball."""
+    """Return plate, frame, bins and trays with walls between them, seesaw, pegs, ball."""
     board = Board(
         physics,
         tilt_deg=p.tilt_deg,
@@ -217,8 +218,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float], bool]:
-    """Two slanted bars that lead a ball at a side onto the seesaw. Returns whether a ball passes between them and a peg
-    at a place (across, up)."""
+    """Return two slanted bars that lead a ball at a side onto the seesaw. Returns whether a ball passes between them
+    and a peg at a place (across, up)."""
     tip = p.pivot_m + TIP_M
     feet = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
     for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), feet, strict=True):
@@ -239,7 +240,7 @@ def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float]
 
 
 def _paint_bands(board: Board, p: Params, top: float) -> None:
-    """Two bands of another shade on the plate, from frame to frame."""
+    """Paint two bands of another shade on the plate, from frame to frame."""
     for i, (low, high) in enumerate(zip(p.bands_m[::2], p.bands_m[1::2], strict=True)):
         across, up = (
             ((low, min(high, board.side)), (SILL_M, top))
@@ -252,14 +253,14 @@ def _paint_bands(board: Board, p: Params, top: float) -> None:
 
 
 def _stand_crates(board: Board, p: Params) -> None:
-    """Boxes on the floor beside the board, which nothing touches."""
+    """Stand boxes on the floor beside the board, which nothing touches."""
     for i, (colour, (across, away, half, tall)) in enumerate(zip(p.crate_colours, p.crates_m, strict=True)):
         at = (across, away, tall)
         add_box(board.spec.worldbody, f"crate_{i}", at, (half, half, tall), colour, contype=0, conaffinity=0)
 
 
 def _add_seesaw(board: Board, p: Params) -> None:
-    """A beam on a pivot in its middle that touches nothing but the ball; a weak spring levels it."""
+    """Add a beam on a pivot in its middle that touches nothing but the ball; a weak spring levels it."""
     import mujoco
 
     half_deep = board.deep / 2
@@ -274,8 +275,8 @@ def _add_seesaw(board: Board, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The bin that the ball's centre is in, or elsewhere for a tray at the side; None above the bins. The margin is how
-    far that centre ends from where another place begins: a wall or the bins' rim."""
+    """Return the bin that the ball's centre is in, or elsewhere for a tray at the side; None above the bins. The margin
+    is how far that centre ends from where another place begins: a wall or the bins' rim."""
     across, up = place(motion, "ball", p.tilt_deg)
     across = across - p.middle_m
     names = np.where(np.abs(across) > p.bin_m, "elsewhere", np.where(across < 0, "left", "right"))
@@ -286,7 +287,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _places(p: Params, rng: np.random.Generator) -> Filled:
-    """The choices are the two bins, in either order, and the rest of the board."""
+    """Return the choices are the two bins, in either order, and the rest of the board."""
     order = (*rng.permutation(["left", "right"]), "elsewhere")
     forms = ("{0} bin", "{1}", "{1} bin", "in the {0} bin", "in the {1} bin", "the {0} bin", "{0} bin ({1})")
     aliases = {f.format(*side): side[0] for side in (("left", "red"), ("right", "blue")) for f in forms}
@@ -311,8 +312,8 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
-    """Where a ball that is past the pegs goes to: the side of the seesaw that it is on, if it goes on as it does, or
-    elsewhere if that is past its end; None before."""
+    """Return where a ball that is past the pegs goes to: the side of the seesaw that it is on, if it goes on as it
+    does, or elsewhere if that is past its end; None before."""
     now, soon = carried_on(path, 0.0), carried_on(path, AHEAD)
     if now is None or soon is None:
         return None
@@ -327,13 +328,13 @@ def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
 
 
 def _ball(frame: np.ndarray, first: np.ndarray, colour: str) -> Blob | None:
-    """The largest region of the ball's colour that was not of that colour in the first frame."""
+    """Return the largest region of the ball's colour that was not of that colour in the first frame."""
     before = cv2.dilate(colour_mask(first, colour).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return next(iter(blobs(colour_mask(frame, colour) & ~before, 40)), None)
 
 
 def _lies(ball: Blob | None, red: Blob, blue: Blob) -> str | None:
-    """The place of a ball by its pixels."""
+    """Return the place of a ball by its pixels."""
     if ball is None or ball.y < red.y + (ball.x - red.x) * (blue.y - red.y) / (blue.x - red.x):
         return None
     if red.box[0] < ball.x < (red.x + blue.x) / 2:

@@ -32,7 +32,7 @@ PLAY = apart(*NAMED)
 
 
 def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
-    """Any but that of the deck."""
+    """Return any but that of the deck."""
     return str(rng.choice([c for c in ("wood", "grey", "black") if c != so_far["deck_colour"]]))
 
 
@@ -77,7 +77,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Deck, incline with its support and the block on it, the board in the deck, tray."""
+    """Return deck, incline with its support and the block on it, the board in the deck, tray."""
     course = Course(physics, p.direction)
     side, far, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
     deep, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
@@ -117,7 +117,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_board(course: Course, p: Params, side: float) -> None:
-    """The rough board, tilted up a little along the deck: it rises out of the deck, or stays below its surface."""
+    """Add the rough board, tilted up a little along the deck: it rises out of the deck, or stays below its surface."""
     begin, end = p.board_span
     half, thick = (end - begin) / 2, 0.03
     rise = half * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
@@ -127,8 +127,8 @@ def _add_board(course: Course, p: Params, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the block is lower than the deck, past its end; 'no' while it is not, from when it moves no more. The
-    margin is how far its middle ends from the end of the deck."""
+    """Return 'yes' while the block is lower than the deck, past its end; 'no' while it is not, from when it moves no
+    more. The margin is how far its middle ends from the end of the deck."""
     block = motion.pos("block")
     past = p.direction * block[:, 0] - p.deck_end_m
     off = (past > 0) & (block[:, 2] < p.deck_m)

@@ -65,7 +65,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Two pairs of bars that reach out of a board, one above the other, the tray below, a cube to one side."""
+    """Return two pairs of bars that reach out of a board, one above the other, the tray below, a cube to one side."""
     course = Course(physics, surface=Surface(solref=SOFT))
     end, high = p.half_m, p.upper_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -113,8 +113,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """What is nearest below the ball where it ends, from when it stays there: the upper bars, the lower ones or the
-    tray. The margin is how far its middle ends from the height halfway to where it would lie otherwise."""
+    """Return what is nearest below the ball where it ends, from when it stays there: the upper bars, the lower ones or
+    the tray. The margin is how far its middle ends from the height halfway to where it would lie otherwise."""
     height = motion.pos("ball")[:, 2]
     lies = [p.upper_m + 0.9 * p.radius_m, p.lower_m + 0.9 * p.radius_m, FLOOR_M + p.radius_m]
     halfway = [(lies[0] + lies[1]) / 2, (lies[1] + lies[2]) / 2]
@@ -126,14 +126,14 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _height(frame: np.ndarray, colour: str) -> float | None:
-    """The mean row (px) of all that has a colour; None if there is little of it."""
+    """Return the mean row (px) of all that has a colour; None if there is little of it."""
     rows = np.flatnonzero(colour_mask(frame, colour).any(axis=1))
     return float(rows.mean()) if len(rows) >= 4 else None
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Which of the colours is nearest to the underside of the resting ball; None while it is not to be seen,
-    and of a question that offers no colours."""
+    """Return which of the colours is nearest to the underside of the resting ball; None while it is not to be seen, and
+    of a question that offers no colours."""
     if "choices" not in named:
         return None
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]

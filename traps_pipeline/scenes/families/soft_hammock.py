@@ -60,7 +60,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Two pairs of posts with the cloth between them, the tray below, a board behind, a cube to one side."""
+    """Return two pairs of posts with the cloth between them, the tray below, a board behind, a cube to one side."""
     course = Course(physics, p.direction, FELT)
     end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
     outer, back = end + WALL_M, side + WALL_M
@@ -94,8 +94,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'no' from when the ball is below half the height of the posts, 'yes' from when it stays over that where it ends.
-    The margin is how far its middle ends from that height."""
+    """Return 'no' from when the ball is below half the height of the posts, 'yes' from when it stays over that where it
+    ends. The margin is how far its middle ends from that height."""
     ball = motion.pos("ball")
     over = ball[:, 2] - p.post_m / 2
     first = lasting_from(over < 0) if over[-1] < 0 else still_from(ball, within_m=STILL_M)
@@ -104,8 +104,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the cloth, once the ball is at rest, is wider than high: it hangs from both sides and holds it. None
-    while either is not to be seen."""
+    """Return whether the cloth, once the ball is at rest, is wider than high: it hangs from both sides and holds it.
+    None while either is not to be seen."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     rows, columns = np.nonzero(colour_mask(frames[-1], named["cloth"]))
     if len(rows) < CLOTH_PX or not at_rest(path, tolerance_px=4):

@@ -56,7 +56,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A board with the peg in it, the tray before it, a cube to one side."""
+    """Return a board with the peg in it, the tray before it, a cube to one side."""
     course = Course(physics, p.direction)
     end, high = p.length_m / 2 + 0.08, p.peg_m + 0.06
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -95,8 +95,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'no' from when the whole rope is below half the height of the peg, 'yes' from when it stays over that where it
-    ends. The margin is how far its highest point ends from that height."""
+    """Return 'no' from when the whole rope is below half the height of the peg, 'yes' from when it stays over that
+    where it ends. The margin is how far its highest point ends from that height."""
     rope = motion.vertices["rope"]
     top = rope[:, :, 2].max(axis=1) - p.peg_m / 2
     first = lasting_from(top < 0) if top[-1] < 0 else still_from(rope, within_m=STILL_M)
@@ -105,7 +105,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The rope, at rest, is tall and ends over the tray, or lies low in it; None while it is not to be seen."""
+    """Return the rope, at rest, is tall and ends over the tray, or lies low in it; None while it is not to be seen."""
     path = [largest(frame, named["rope"], 60) for frame in frames[-3:]]
     end = path[-1]
     if end is None or not at_rest(path, tolerance_px=4):

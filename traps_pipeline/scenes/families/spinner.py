@@ -63,7 +63,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """The hub is at the origin."""
+    """Return the hub is at the origin."""
     course = Course(physics, p.direction)
     r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
     start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
@@ -113,7 +113,7 @@ def _place(radius: float, angle_deg: float) -> tuple[float, float]:
 
 
 def _add_pointer(course: Course, p: Params) -> None:
-    """A bar that turns about the hub; at the start it points to the near side, across the ball's path."""
+    """Add a bar that turns about the hub; at the start it points to the near side, across the ball's path."""
     half = POINTER * p.disc_m / 2
     body = course.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
     joint = body.first_joint()
@@ -124,7 +124,7 @@ def _add_pointer(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The sector that the pointer is in, from when it turns no more. The margin is how far its tip ends from the
+    """Return the sector that the pointer is in, from when it turns no more. The margin is how far its tip ends from the
     nearest edge of that sector."""
     tip = -motion.rot("pointer")[:, :2, 1]
     angles = np.degrees(np.arctan2(p.direction * tip[:, 0], -tip[:, 1])) % 360  # from the near side
@@ -138,7 +138,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """The colour that surrounds the black pointer once it is at rest."""
+    """Return the colour that surrounds the black pointer once it is at rest."""
     pointers = [_pointer(frame) for frame in frames[-3:]]
     if pointers[-1][0] is None or (ahead is None and not at_rest([found for found, _ in pointers])):
         return None
@@ -149,7 +149,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = 
 
 
 def _pointer(frame: np.ndarray) -> tuple[Blob | None, np.ndarray]:
-    """The largest black thing, with the gap that the peg may cut into it closed, and its mask."""
+    """Return the largest black thing, with the gap that the peg may cut into it closed, and its mask."""
     black = colour_mask(frame, POINTER_COLOUR).astype(np.uint8)
     black = cv2.morphologyEx(black, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8))
     found = next(iter(blobs(black, 150)), None)

@@ -31,7 +31,8 @@ PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 def _plungers(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float, str, str]:
-    """The damping of this plunger and of the twin's, one lively and one stuck, and the colours of lane and tunnel."""
+    """Return the damping of this plunger and of the twin's, one lively and one stuck, and the colours of lane and
+    tunnel."""
     dampings = (uniform(rng, 0.4, 1.0), uniform(rng, 60, 90))
     lane, tunnel = rng.permutation(["grey", "white", "black"])[:2]
     first = int(rng.integers(2))
@@ -77,7 +78,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Deck with a tunnel, step, lower lane with a line across, plunger. Lengths run along the roll."""
+    """Return deck with a tunnel, step, lower lane with a line across, plunger. Lengths run along the roll."""
     course = Course(physics, p.direction, Surface(2e-5, solref=SOFT))
     r, wide = p.radius_m, 1.9 * p.radius_m
     deck, end, line = LANE_M + p.step_m, p.head_m + 0.32, p.head_m - p.line_m
@@ -133,15 +134,15 @@ def _add_plunger(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' from when the ball's centre is back over the line after it has met the plunger, 'no' while it is not; None
-    before it has met the plunger. The margin is how far that centre ends from the line."""
+    """Return 'yes' from when the ball's centre is back over the line after it has met the plunger, 'no' while it is
+    not; None before it has met the plunger. The margin is how far that centre ends from the line."""
     back = p.head_m - p.line_m - p.direction * motion.pos("ball")[:, 0]
     met = np.maximum.accumulate(-back) > p.line_m - p.radius_m - FEEL_M
     return Reading(side_while(met, back), float(abs(back[-1])))
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """Whether the resting ball is on the side of the line that it came from."""
+    """Return whether the resting ball is on the side of the line that it came from."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     start, end = rounded(frames[0], named["ball"]), end_of(path, ahead)
     parts = [blob for blob in blobs(colour_mask(frames[-1], named["line"]), 15) if blob.area < 4000]

@@ -76,7 +76,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Lengths run along the ball's path from the middle of the stack."""
+    """Return lengths run along the ball's path from the middle of the stack."""
     course = Course(physics, p.direction)
     ledge, stand, half_w = p.ledge_m, p.stand_half_m, p.block_width_m / 2
     plate, end = -half_w - 0.025, stand + p.tray_m
@@ -116,7 +116,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_pusher(course: Course, p: Params, plate: float) -> None:
-    """A tall plate on a slide, with a rod back to the pad that the ball strikes."""
+    """Add a tall plate on a slide, with a rod back to the pad that the ball strikes."""
     import mujoco
 
     way, half = p.direction, (p.stack_m + 0.005) / 2
@@ -133,14 +133,14 @@ def _add_pusher(course: Course, p: Params, plate: float) -> None:
 
 
 def _standing(motion: Motion, p: Params) -> np.ndarray:
-    """Whether each block is over the stand, shape (F, blocks)."""
+    """Return whether each block is over the stand, shape (F, blocks)."""
     at = np.stack([motion.pos(block) for block in BLOCKS], axis=1)
     return (np.abs(at[..., 0]) < p.stand_half_m) & (at[..., 2] > p.stand_m)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The range of the number of standing blocks, from when the pusher has gone all its way and no block moves. The
-    margin is how far the block nearest to the edge of the stand is from it."""
+    """Return the range of the number of standing blocks, from when the pusher has gone all its way and no block moves.
+    The margin is how far the block nearest to the edge of the stand is from it."""
     still = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
     pushed = p.direction * (motion.pos("pusher") - motion.pos("pusher")[0])[:, 0] > 0.95 * p.travel_m
     counts = _standing(motion, p).sum(axis=1)
@@ -149,7 +149,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
-    """Every standing block; of the fallen ones, which may lie behind each other, enough to be seen there."""
+    """Return every standing block; of the fallen ones, which may lie behind each other, enough to be seen there."""
     standing = _standing(motion, p)[-1]
     groups = [((BLOCKS[i],), 150.0) for i in np.flatnonzero(standing)]
     fallen = tuple(BLOCKS[i] for i in np.flatnonzero(~standing))
@@ -157,7 +157,7 @@ def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Counts the block colours that lie above the black stand and within its width."""
+    """Return counts the block colours that lie above the black stand and within its width."""
     counts = [_count(frame, named["stand"]) for frame in frames[-3:]]
     if counts[-1] is None or len(set(counts)) > 1:
         return None
@@ -165,7 +165,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Counts the blocks that are over the stand in the last frame: whatever is beside it falls."""
+    """Return counts the blocks that are over the stand in the last frame: whatever is beside it falls."""
     count = _count(frames[-1], named["stand"])
     return None if count is None else range_of(RANGES, count)
 
@@ -175,8 +175,8 @@ def _count(frame: np.ndarray, stand_colour: str) -> int | None:
     if stand is None:
         return None
     x, y, width, _ = stand.box
-    found = [blobs(colour_mask(frame, colour), 60) for colour in COLOURS]
-    return sum(any(x - 4 < b.x < x + width + 4 and b.y < y + 0.4 * width for b in parts) for parts in found)
+    blobs_by_colour = [blobs(colour_mask(frame, colour), 60) for colour in COLOURS]
+    return sum(any(x - 4 < b.x < x + width + 4 and b.y < y + 0.4 * width for b in parts) for parts in blobs_by_colour)
 
 
 FAMILY = scene_family(

@@ -70,8 +70,8 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Pedestal, three trays with a high back and a low front, two boards before the back that hang from their upper
-    edges."""
+    """Return pedestal, three trays with a high back and a low front, two boards before the back that hang from their
+    upper edges."""
     course = Course(physics, surface=Surface(0.006, sliding=0.5, solref=SOFT))
     r, side, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
     deep, outer, foot = (-DEPTH_M, DEPTH_M), (-side - WALL_M, side + WALL_M), (start - 0.08, start + 0.08)
@@ -112,8 +112,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The colour of the tray that the ball is over while its centre is hardly higher than the dividers; None while it
-    is higher. The margin is how far that centre ends from the nearest divider, or below its upper edge."""
+    """Return the colour of the tray that the ball is over while its centre is hardly higher than the dividers; None
+    while it is higher. The margin is how far that centre ends from the nearest divider, or below its upper edge."""
     ball = motion.pos("ball")
     place = ball[:, 0] / p.tray_m + 1.5  # in tray widths from the left end
     over, low = np.clip(np.floor(place), 0, 2).astype(int), ball[:, 2] < DIVIDER_M + 0.02
@@ -123,12 +123,12 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _colours(named: Mapping[str, str]) -> Sequence[str]:
-    """The colours that the question offers, or all that a tray beside this ball may have."""
+    """Return the colours that the question offers, or all that a tray beside this ball may have."""
     return offered(named, [colour for colour in COLOURS if colour != named["ball"]])
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The tray colour that most of the picture around the resting ball has."""
+    """Return the tray colour that most of the picture around the resting ball has."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     ball = path[-1]
     if ball is None or not at_rest(path):
@@ -142,7 +142,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The tray that the boards of the chute lead to: the middle one if they hang straight down."""
+    """Return the tray that the boards of the chute lead to: the middle one if they hang straight down."""
     trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(named)}
     seen = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
     in_order = sorted(seen, key=lambda colour: seen[colour].x)

@@ -55,7 +55,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Lengths run along the ball's path from the middle of the pillar."""
+    """Return lengths run along the ball's path from the middle of the pillar."""
     course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.width_m / 2, HALF_DEPTH_M
     ledge = p.strike * p.pillar_m - r  # height of the ledge that the ball rolls on
@@ -100,15 +100,15 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the pillar's top is below half its height; 'no' while it is not, from when neither the pillar nor
-    the ball moves any more. The margin is how far the top ends above or below half the height."""
+    """Return 'yes' while the pillar's top is below half its height; 'no' while it is not, from when neither the pillar
+    nor the ball moves any more. The margin is how far the top ends above or below half the height."""
     top = top_m(motion, "pillar", p.pillar_m)
     still = still_from(motion.pos("pillar"), motion.pos("ball"), top, within_m=0.003)
     return Reading(yes_while(top < p.pillar_m / 2, still), float(abs(top[-1] - p.pillar_m / 2)))
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The named pillar, seen at the start and at the end: is it still about as high in the picture as it was?"""
+    """Return the named pillar, seen at the start and at the end: is it still about as high in the picture as it was?"""
     path = track(frames, named["pillar"], 80)
     first, last = path[0], path[-1]
     if first is None or last is None or not at_rest(path) or first.box[3] < 1.2 * first.box[2]:
@@ -117,7 +117,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the pillar leans: it is wider in the picture than it was, or lower."""
+    """Return whether the pillar leans: it is wider in the picture than it was, or lower."""
     first, last = largest(frames[0], named["pillar"], 80), largest(frames[-1], named["pillar"], 80)
     if first is None or last is None or first.box[3] < 1.2 * first.box[2]:
         return None

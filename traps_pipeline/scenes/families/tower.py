@@ -70,7 +70,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Lengths run along the ball's path from the middle of the tower."""
+    """Return lengths run along the ball's path from the middle of the tower."""
     course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
     ledge = p.strike * p.block_height_m - r  # height of the ledge that the ball rolls on
@@ -123,8 +123,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the top block is on the ground; 'no' while it is at its height on the tower, from when neither the
-    ball nor the block moves any more. The margin is how far it ends from the middle of its fall."""
+    """Return 'yes' while the top block is on the ground; 'no' while it is at its height on the tower, from when neither
+    the ball nor the block moves any more. The margin is how far it ends from the middle of its fall."""
     top = motion.pos(p.names[-1])
     down, up = top[:, 2] < 1.3 * p.block_height_m, top[:, 2] > p.tower_m - 0.6 * p.block_height_m
     still = still_from(top, motion.pos("ball"), within_m=STILL_M)
@@ -133,7 +133,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The named block, seen at the start and at the end: has it come down by more than its own size?"""
+    """Return the named block, seen at the start and at the end: has it come down by more than its own size?"""
     path = track(frames, named["top"], 60)
     first, last = path[0], path[-1]
     if first is None or last is None or not at_rest(path):
@@ -144,7 +144,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the block has left its place at the top, or leans over: from there it falls."""
+    """Return whether the block has left its place at the top, or leans over: from there it falls."""
     first, last = largest(frames[0], named["top"], 60), largest(frames[-1], named["top"], 60)
     if first is None or last is None:
         return None
@@ -152,7 +152,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether a block of another colour is higher in the end than the named one, which was the highest."""
+    """Return whether a block of another colour is higher in the end than the named one, which was the highest."""
     top = end_of(track(frames, named["top"], 60))
     if top is None:
         return None

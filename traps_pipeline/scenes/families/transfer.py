@@ -65,7 +65,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Ramp, step, deck with low rims, zone before an end wall."""
+    """Return ramp, step, deck with low rims, zone before an end wall."""
     course = Course(physics, p.direction)
     r, end, board_at = p.radius_m, p.zone_at_m + p.zone_m, p.block_at_m - p.block_m / 2 - 0.03
     deep, outer, deck = (-SIDE_M, SIDE_M), (-SIDE_M - WALL_M, SIDE_M + WALL_M), (0, DECK_M)
@@ -98,7 +98,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_target(course: Course, p: Params) -> None:
-    """The free block, a cube or an upright cylinder."""
+    """Add the free block, a cube or an upright cylinder."""
     import mujoco
 
     half = p.block_m / 2
@@ -112,8 +112,8 @@ def _add_target(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """'yes' while the middle of the block is in the zone; 'no' while it is not, from when the block moves no more. The
-    margin is how far it ends inside the zone by its middle, or short of it by its front."""
+    """Return 'yes' while the middle of the block is in the zone; 'no' while it is not, from when the block moves no
+    more. The margin is how far it ends inside the zone by its middle, or short of it by its front."""
     ahead = p.direction * motion.pos("block")[:, 0] - p.zone_at_m
     return Reading(yes_while(ahead > 0, still_from(ahead, within_m=STILL_M)), clear_m(ahead, p.block_m / 2))
 

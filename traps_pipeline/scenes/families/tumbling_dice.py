@@ -43,7 +43,7 @@ def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
 
 
 def _width(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Room for a turning die beside each wall."""
+    """Return room for a turning die beside each wall."""
     return round(max(0.46, (2.5 * so_far["dice"] + 1.4) * so_far["half_m"]), 4)
 
 
@@ -55,7 +55,7 @@ def _turns(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], 
 
 
 def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
-    """A zigzag, so that the dice do not touch before they land."""
+    """Return a zigzag, so that the dice do not touch before they land."""
     dice, half, ahead = so_far["dice"], so_far["half_m"], so_far["ahead"]
     lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
     return tuple(
@@ -103,12 +103,12 @@ class Params:
         return self.steps * self.step_m
 
     def floor_m(self, step: int) -> float:
-        """Height of a step, the tray being one after the last."""
+        """Return height of a step, the tray being one after the last."""
         return TRAY_M + (self.steps - step) * self.drop_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Steps and tray between two walls. Lengths run down the steps."""
+    """Return steps and tray between two walls. Lengths run down the steps."""
     course = Course(physics, p.direction)
     # The edges keep their colour in shade.
     course.spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)
@@ -150,7 +150,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:
-    """The edges of the glass box that dice bounce off: four upright ones from floor to top, and the rails around it."""
+    """Add the edges of the glass box that dice bounce off: four upright ones from floor to top, and the rails around
+    it."""
     bars = [((x, y, up[0]), (x, y, up[1])) for x in along for y in (-side, side)]
     bars += [((along[0], y, up[1]), (along[1], y, up[1])) for y in (-side, side)]
     bars += [((x, -side, up[1]), (x, side, up[1])) for x in along]
@@ -159,7 +160,7 @@ def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up
 
 
 def _add_die(course: Course, p: Params, i: int) -> None:
-    """A cube in the edge colour with a thin plate, drawn only, on every face."""
+    """Add a cube in the edge colour with a thin plate, drawn only, on every face."""
     (along, across, above), h, edge = p.starts_m[i], p.half_m, p.edge_colours[i]
     body = course.free_box(f"die_{i}", (along, across, p.floor_m(0) + above), (h, h, h), edge, density=600.0)
     body.quat, cube = list(p.turns[i]), body.first_geom()
@@ -172,21 +173,22 @@ def _add_die(course: Course, p: Params, i: int) -> None:
 
 
 def _short_of_tray(motion: Motion, p: Params) -> tuple[np.ndarray, np.ndarray]:
-    """How far (m) each die is from being past the last step, and from being low enough to touch the tray, (F, dice)."""
+    """Return how far (m) each die is from being past the last step, and from being low enough to touch the tray, (F,
+    dice)."""
     places = np.stack([motion.pos(f"die_{i}") for i in range(len(p.faces))], axis=1)
     return p.run_m - p.direction * places[..., 0], places[..., 2] - TRAY_M - 2.1 * p.half_m
 
 
 def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
-    """The first die in the tray and the frame it is there; None without one. By the look of it, a die may reach the
-    tray when it is past the steps or when it lands: the same die must be clearly the first by either."""
+    """Return the first die in the tray and the frame it is there; None without one. By the look of it, a die may reach
+    the tray when it is past the steps or when it lands: the same die must be clearly the first by either."""
     along, above = _short_of_tray(motion, p)
     firsts = [_first(reached, motion.times) for reached in (along <= 0, np.maximum(along, above) <= 0)]
     return firsts[1] if firsts[0] and firsts[1] and firsts[0][0] == firsts[1][0] else None
 
 
 def _first(reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
-    """The die (column) that is first to reach something, and the frame; None if another comes too soon after."""
+    """Return the die (column) that is first to reach something, and the frame; None if another comes too soon after."""
     arrivals = np.where(reached.any(axis=0), times[reached.argmax(axis=0)], math.inf)
     first, second = np.sort(arrivals)[:2]
     if math.isinf(first) or second - first < LEAD_S - 1e-9:
@@ -196,20 +198,20 @@ def _first(reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
 
 
 def _lean(motion: Motion, die: int) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the uppermost face and its angle to the horizontal (rad), each (F,)."""
+    """Return index of the uppermost face and its angle to the horizontal (rad), each (F,)."""
     heights = motion.rot(f"die_{die}").swapaxes(1, 2) @ np.array([0, 0, 1.0])
     faces = np.stack([heights, -heights], axis=2).reshape(len(heights), 6)
     return faces.argmax(axis=1), np.arccos(np.clip(faces.max(axis=1), -1, 1))
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The upper colour of the first die in the tray, while it lies flat and still (by displacement). The margin is the
-    smaller of two distances: how far the next die was from the tray when the first came, and how much an edge of the
-    lying die would have to rise for another face to come up."""
-    found = _first_die(motion, p)
-    if found is None:
+    """Return the upper colour of the first die in the tray, while it lies flat and still (by displacement). The margin
+    is the smaller of two distances: how far the next die was from the tray when the first came, and how much an edge of
+    the lying die would have to rise for another face to come up."""
+    first = _first_die(motion, p)
+    if first is None:
         return Reading(undecided(motion), 0.0)
-    die, arrival = found
+    die, arrival = first
     top, lean = _lean(motion, die)
     moved = np.linalg.norm(np.diff(motion.pos(f"die_{die}"), axis=0, prepend=math.inf), axis=1)
     lies = (lean < FLAT_RAD) & (moved < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
@@ -220,18 +222,19 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _in_order(motion: Motion, p: Params, die: int) -> tuple[int, int]:
-    """The frames from which the first die and another one are past the steps: in between, one sees which is first."""
+    """Return the frames from which the first die and another one are past the steps: in between, one sees which is
+    first."""
     past = _short_of_tray(motion, p)[0] <= 0
     others: np.ndarray = np.delete(past, die, axis=1).max(axis=1)
     return int(past[:, die].argmax()), int(others.argmax()) if others.any() else len(past)
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
-    """The face that lies on top of the first die in the tray."""
-    found = _first_die(motion, p)
-    if found is None:
+    """Return the face that lies on top of the first die in the tray."""
+    first = _first_die(motion, p)
+    if first is None:
         return []
-    die = found[0]
+    die = first[0]
     return [((f"die_{die}_{p.faces[die][_lean(motion, die)[0][-1]]}",), LEGIBLE_PIXELS)]
 
 
@@ -270,7 +273,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
-    """The die with edges of a colour: the largest region of that colour whose outline holds much vivid face."""
+    """Return the die with edges of a colour: the largest region of that colour whose outline holds much vivid face."""
     high, low = frame.max(axis=2).astype(int), frame.min(axis=2)
     vivid = (high - low > 0.68 * high) & (high > 60)
     if edge == "white":
@@ -289,7 +292,7 @@ def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
 
 
 def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
-    """Where the steps end: the line x = slope y + offset, and on which side of it the tray lies (+1: right)."""
+    """Return where the steps end: the line x = slope y + offset, and on which side of it the tray lies (+1: right)."""
     still = np.median(frames, axis=0).astype(np.uint8)
     shade = still.mean(axis=2)
     grey = (np.ptp(still, axis=2) < 22) & (shade > 125) & (shade < 185)
@@ -320,7 +323,7 @@ def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
 def _first_over(
     edge: tuple[int, float, float] | None, dice: Sequence[Sequence[_Sight | None]]
 ) -> Sequence[_Sight | None] | None:
-    """The path of the die that is first past the edge; of two in one frame, the one that is farther past it."""
+    """Return the path of the die that is first past the edge; of two in one frame, the one that is farther past it."""
     if edge is None or not dice:
         return None
     side, slope, offset = edge
@@ -335,8 +338,8 @@ def _first_over(
 
 
 def _came_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
-    """Whether a die lies still at the end and came there by itself: other things went on moving, or its last steps were
-    small. A clip that merely freezes stops everything at once, in full motion."""
+    """Return whether a die lies still at the end and came there by itself: other things went on moving, or its last
+    steps were small. A clip that merely freezes stops everything at once, in full motion."""
     places = np.array([(math.nan, math.nan) if sight is None else (sight.x, sight.y) for sight in path])
     lies = np.linalg.norm(places - np.median(places[-3:], axis=0), axis=1) <= NEAR_PX
     if lies.all() or not lies[-3:].all():

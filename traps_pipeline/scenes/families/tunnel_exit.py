@@ -57,7 +57,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """The fork stands in the middle, its front at the origin; the ramp leads down to it from the back."""
+    """Return the fork stands in the middle, its front at the origin; the ramp leads down to it from the back."""
     course = Course(physics)
     r, wide, depth = p.radius_m, p.half_width_m, p.depth_m
     roof, bore, end = FLOOR_M + 2.8 * r, 1.3 * r, p.half_width_m + p.tray_m
@@ -102,7 +102,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
-    """The ramp with its cover below, its rails above, and a post under its upper end."""
+    """Add the ramp with its cover below, its rails above, and a post under its upper end."""
     length, outer, top = p.covered_m + p.open_m, bore + WALL_M, 2.7 * p.radius_m
 
     def board(name: str, across: Span, up: Span, over: Span, colour: str, side: int = 1) -> None:
@@ -119,14 +119,14 @@ def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """The side on which the ball is wholly out of the tunnel. The margin is how far outside the fork it ends."""
+    """Return the side on which the ball is wholly out of the tunnel. The margin is how far outside the fork it ends."""
     across = motion.pos("ball")[:, 0]
     outside = np.abs(across) - p.radius_m - p.half_width_m
     return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """The side of the tunnel on which the ball lies at the end."""
+    """Return the side of the tunnel on which the ball lies at the end."""
     path = [small(frame, named["ball"]) for frame in frames[-3:]]
     tunnel, ball = largest(frames[-1], named["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
     if ball is None or tunnel is None:

@@ -53,7 +53,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """A ramp, a road with an end wall, a bridge on four legs across the road."""
+    """Return a ramp, a road with an end wall, a bridge on four legs across the road."""
     course = Course(physics, p.direction)
     r, end, side = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
     deep, road = (-side, side), (0, ROAD_M)
@@ -96,7 +96,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
-    """The ramp down to the road; gives the place where the ball starts on it."""
+    """Return the ramp down to the road; gives the place where the ball starts on it."""
     slope, thick = float(np.radians(p.slope_deg)), 0.012
     length = p.ramp_m / np.cos(slope)
     foot = np.array([-p.flat_m, ROAD_M])
@@ -111,7 +111,7 @@ def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
 
 
 def _add_bridge(course: Course, p: Params) -> None:
-    """A humped deck of planks on four legs, with a railing on either edge."""
+    """Add a humped deck of planks on four legs, with a railing on either edge."""
     side, post, pitch, colour = p.span_m / 2, 0.014, p.span_m / p.planks, p.bridge_colour
     edges = ((0, 2 * post), (p.bridge_m - 2 * post, p.bridge_m))
     for k in range(p.planks):
@@ -128,7 +128,7 @@ def _add_bridge(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Whether the ball is wholly past the bridge, or stays where it is under it."""
+    """Return whether the ball is wholly past the bridge, or stays where it is under it."""
     return came_through(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.bridge_m, p.radius_m)
 
 

@@ -29,8 +29,8 @@ GLASS_GAP_M = 0.006  # play of a ball under the glass that keeps it on the board
 
 
 def peg_rows(least: int, most: int) -> Group:
-    """The fields `rows` (their number), `peg_gap_m` (from peg to peg in a row) and `row_shifts_m` (sideways shift of
-    every row, lowest first) of staggered rows, in half of the draws skewed as well."""
+    """Return the fields `rows` (their number), `peg_gap_m` (from peg to peg in a row) and `row_shifts_m` (sideways
+    shift of every row, lowest first) of staggered rows, in half of the draws skewed as well."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[int, float, tuple[float, ...]]:
         rows, gap = int(rng.integers(least, most + 1)), uniform(rng, 0.126, 0.140)
@@ -42,8 +42,8 @@ def peg_rows(least: int, most: int) -> Group:
 
 
 def looking_on(low: float, high: float) -> Any:
-    """Elevation (degrees) of a camera that looks onto the board, off its normal by so many degrees. Needs a field
-    `tilt_deg` above it."""
+    """Return elevation (degrees) of a camera that looks onto the board, off its normal by so many degrees. Needs a
+    field `tilt_deg` above it."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90)
 
 
@@ -51,13 +51,13 @@ def looking_on(low: float, high: float) -> Any:
 
 
 def slope(tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors up the board and out of it, in the world."""
+    """Return unit vectors up the board and out of it, in the world."""
     tilt = math.radians(tilt_deg)
     return np.array([0, math.cos(tilt), math.sin(tilt)]), np.array([0, -math.sin(tilt), math.cos(tilt)])
 
 
 def turned(angle_rad: float, axis: int) -> list[float]:
-    """Quaternion of a turn about the x axis (1), y axis (2) or z axis (3)."""
+    """Return quaternion of a turn about the x axis (1), y axis (2) or z axis (3)."""
     return [math.cos(angle_rad / 2), *(math.sin(angle_rad / 2) * (i == axis) for i in (1, 2, 3))]
 
 
@@ -97,7 +97,7 @@ class Board:
         )
 
     def block(self, name: str, across: Span, up: Span, out: Span, colour: str, *, solid: bool = True) -> mujoco.MjsGeom:
-        """A box of the board from its three spans. solid=False: paint, which is drawn and touches nothing."""
+        """Return a box of the board from its three spans. solid=False: paint, which is drawn and touches nothing."""
         spans = (across, up, out)
         centre, half = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
         geom = add_box(self.body, name, centre, half, colour)
@@ -108,7 +108,7 @@ class Board:
         return geom
 
     def paint(self, name: str, centre: Vec3, half: Vec3, colour: str) -> mujoco.MjsGeom:
-        """A box from its centre and half sizes that is drawn and touches nothing."""
+        """Return a box from its centre and half sizes that is drawn and touches nothing."""
         return add_box(self.body, name, centre, half, colour, contype=0, conaffinity=0)
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
@@ -171,32 +171,32 @@ class Board:
     def ball(
         self, name: str, at: tuple[float, float], colour: str, friction: tuple[float, float, float] = (0.5, 0.005, 2e-4)
     ) -> mujoco.MjsGeom:
-        """A free ball that lies on the board at (across, up)."""
+        """Return a free ball that lies on the board at (across, up)."""
         centre = self.up * at[1] + self.normal * self.ball_radius_m + np.array([at[0], 0, LIFT_M])
         geom = add_ball(self.spec, name, centre.tolist(), self.ball_radius_m, colour)
         geom.friction = list(friction)
         return geom
 
     def throw(self, push_m_s: float, rise_m: float) -> tuple[float, ...]:
-        """Velocity of a ball that rolls, without slipping, sideways at a speed and just so far up the slope."""
+        """Return velocity of a ball that rolls, without slipping, sideways at a speed and just so far up the slope."""
         slowing = 5 / 7 * self.physics.gravity_m_s2 * math.sin(math.radians(self.tilt_deg))
         velocity = self.up * math.sqrt(2 * slowing * rise_m) + np.array([push_m_s, 0, 0])
         return (*velocity.tolist(), *(np.cross(self.normal, velocity) / self.ball_radius_m).tolist())
 
     def region(self, up: Span, out: float) -> Box:
-        """The box around a strip of the board from side to side, so far out of it (m)."""
+        """Return the box around a strip of the board from side to side, so far out of it (m)."""
         corners = np.array([self.up * height + self.normal * away for height in up for away in (0.0, out)])
         (_, near, low), (_, far, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
         return Box((-self.outer, near, low + LIFT_M), (self.outer, far, high + LIFT_M))
 
     def ends(self, top: float) -> tuple[Box, ...]:
-        """The lower edge of the board and the upper one of its frame, which the camera must see."""
+        """Return the lower edge of the board and the upper one of its frame, which the camera must see."""
         edges = [(self.up * height).tolist() for height in (0.0, top + 2 * WALL_M)]
         return tuple(Box((-self.outer, y, z + LIFT_M), (self.outer, y, z + LIFT_M)) for _, y, z in edges)
 
 
 def place(motion: Motion, body: str, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where a body is across the board, from its middle, and up the board (m), each (F,)."""
+    """Return where a body is across the board, from its middle, and up the board (m), each (F,)."""
     position = motion.pos(body) - np.array([0, 0, LIFT_M])
     return position[:, 0], position @ slope(tilt_deg)[0]
 
@@ -205,6 +205,6 @@ def place(motion: Motion, body: str, tilt_deg: float) -> tuple[np.ndarray, np.nd
 
 
 def round_ball(frame: np.ndarray, colour: str) -> Blob | None:
-    """The largest round thing of a ball's size that has a colour."""
-    found = blobs(colour_mask(frame, colour), min_area=90)
-    return next((b for b in found if b.area < 900 and b.fill > 0.6 and 0.7 < b.box[2] / b.box[3] < 1.4), None)
+    """Return the largest round thing of a ball's size that has a colour."""
+    candidates = blobs(colour_mask(frame, colour), min_area=90)
+    return next((b for b in candidates if b.area < 900 and b.fill > 0.6 and 0.7 < b.box[2] / b.box[3] < 1.4), None)

@@ -76,8 +76,8 @@ SOFT = (0.01, 1.0)  # solref of a contact that swallows a fall
 
 
 def brake(radius_m: float, lost: float, length_m: float, physics: Physics) -> float:
-    """Rolling friction (m) that takes, over a length, so much (m2/s2) of the square of a rolling ball's speed: a solid
-    ball slows at 5 g mu / 7 r."""
+    """Return rolling friction (m) that takes, over a length, so much (m2/s2) of the square of a rolling ball's speed: a
+    solid ball slows at 5 g mu / 7 r."""
     return 7 / 5 * radius_m * lost / (2 * length_m * physics.gravity_m_s2)
 
 
@@ -96,7 +96,7 @@ class Course:
         self._marks: dict[str, tuple[Vec3, Sequence[float]]] = {}  # phrase -> foot in the world, colour
 
     def towards(self, direction: int) -> Course:
-        """The same world with its way to a side: what stands on both sides of a middle is written once."""
+        """Return the same world with its way to a side: what stands on both sides of a middle is written once."""
         other = copy(self)
         other.direction = direction
         return other
@@ -114,7 +114,7 @@ class Course:
         *,
         solid: bool = True,
     ) -> mujoco.MjsGeom:
-        """A static box from its three spans. solid=False: paint, which is drawn and touches nothing."""
+        """Return a static box from its three spans. solid=False: paint, which is drawn and touches nothing."""
         middle = (self.direction * sum(along) / 2, sum(across) / 2, sum(up) / 2)
         half = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (up[1] - up[0]) / 2)
         geom = add_box(self.spec.worldbody, name, middle, half, colour)
@@ -140,7 +140,7 @@ class Course:
             self.block(f"{name}_{part}", along, across, up, colour, surface)
 
     def plank(self, name: str, a: Point, b: Point, half_width: float, colour: str) -> mujoco.MjsGeom:
-        """A plank, 16 mm thick, whose upper face runs from one point of the way to the next."""
+        """Return a plank, 16 mm thick, whose upper face runs from one point of the way to the next."""
         (xa, za), (xb, zb) = sorted(((self.direction * u, z) for u, z in (a, b)))
         angle, half_thick = -float(np.arctan2(zb - za, xb - xa)), 0.008
         centre = ((xa + xb) / 2 - half_thick * np.sin(angle), 0.0, (za + zb) / 2 - half_thick * np.cos(angle))
@@ -148,7 +148,9 @@ class Course:
         return add_box(self.spec.worldbody, name, centre, half, colour, euler_y=angle)
 
     def slab(self, name: str, centre: Vec3, half: Vec3, colour: str, *, falls_rad: float = 0.0) -> mujoco.MjsGeom:
-        """A static box from its centre and half sizes, which may fall by an angle along the way, as a ramp does."""
+        """Return a static box from its centre and half sizes, which may fall by an angle along the way, as a ramp
+        does.
+        """
         at = (self.direction * centre[0], centre[1], centre[2])
         return add_box(self.spec.worldbody, name, at, half, colour, euler_y=self.direction * falls_rad)
 
@@ -167,8 +169,8 @@ class Course:
         front: float | None = None,
         floor: Surface | None = None,
     ) -> tuple[str, ...]:
-        """A floor with the walls that are given a height of their upper edge (m, over the ground): near and far stand
-        outside `along`, back and front inside `across`, on the level of the floor's lower face.
+        """Return a floor with the walls that are given a height of their upper edge (m, over the ground): near and far
+        stand outside `along`, back and front inside `across`, on the level of the floor's lower face.
 
         The geoms are `<name>_floor`, `<name>_near` and so on; their names are returned.
         """
@@ -197,7 +199,8 @@ class Course:
         solid: bool = True,
         body: mujoco.MjsBody | None = None,
     ) -> mujoco.MjsGeom:
-        """A round rod from one place to another; of a body that moves if one is given, in that body's own places."""
+        """Return a round rod from one place to another; of a body that moves if one is given, in that body's own
+        places."""
         import mujoco
 
         ends = [value for at in (a, b) for value in (self.direction * at[0], at[1], at[2])]
@@ -210,7 +213,7 @@ class Course:
     def post(
         self, name: str, at: Vec3, radius: float, half: float, colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
-        """An upright cylinder of half a height, its middle at a place; `body` as in `rod`."""
+        """Return an upright cylinder of half a height, its middle at a place; `body` as in `rod`."""
         import mujoco
 
         geom = (body or self.spec.worldbody).add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER)
@@ -220,7 +223,7 @@ class Course:
     def hull(
         self, name: str, corners: Sequence[Vec3], colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
-        """The convex body around some corners, which is drawn and touches nothing; `body` as in `rod`."""
+        """Return the convex body around some corners, which is drawn and touches nothing; `body` as in `rod`."""
         import mujoco
 
         places = [value for at in corners for value in (self.direction * at[0], at[1], at[2])]
@@ -245,7 +248,7 @@ class Course:
         sliding: float = 0.8,
         density: float = 1000.0,
     ) -> mujoco.MjsGeom:
-        """A free ball, its centre at a place.
+        """Return a free ball, its centre at a place.
 
         speed: along the way (m/s), rolling without slipping. thrown: speeds along and up (m/s), without spin, instead.
         rolling, sliding: friction as in `Surface`. density: kg/m3.
@@ -274,7 +277,7 @@ class Course:
         sliding: float | None = None,
         solref: tuple[float, float] | None = None,
     ) -> mujoco.MjsBody:
-        """A box that can be pushed and can fall: body and geom `name`, centre at a place. density: kg/m3.
+        """Return a box that can be pushed and can fall: body and geom `name`, centre at a place. density: kg/m3.
 
         sliding, solref: as in `Surface`; None leaves MuJoCo's own.
         """
@@ -314,7 +317,7 @@ class Course:
         damping: float = 0.0,
         range_deg: Span | None = None,
     ) -> mujoco.MjsBody:
-        """A body that turns about an axis through a place; parts are added to it with `add_box` and `rod`.
+        """Return a body that turns about an axis through a place; parts are added to it with `add_box` and `rod`.
 
         damping: N m s/rad. range_deg: how far it turns, as MuJoCo counts it; None turns freely. A spring is set on
         `body.first_joint()`.
@@ -381,7 +384,7 @@ class Course:
         azimuth_deg: float,
         colour: Sequence[float],
     ) -> Box:
-        """A mast and its flag, which touch nothing and weigh nothing. Returns the box around the flag."""
+        """Return a mast and its flag, which touch nothing and weigh nothing. Returns the box around the flag."""
         import mujoco
 
         top, half = float(centre[2] + size[1] / 2), np.radians(azimuth_deg - 90) / 2
@@ -398,17 +401,19 @@ class Course:
     # --- what panel and camera must reach ---
 
     def box(self, along: Span, across: Span, up: Span, *, left: float = 0.0, right: float = 0.0) -> Box:
-        """A box in the world. left, right: how much longer (m) it is at its left and right end in the picture,
+        """Return a box in the world. left, right: how much longer (m) it is at its left and right end in the picture,
         whichever the direction: shadows fall to the right."""
         low, high = sorted((self.direction * along[0], self.direction * along[1]))
         return Box((low - left, across[0], up[0]), (high + right, across[1], up[1]))
 
     def ahead(self, length: float) -> float:
-        """The length if the way leads to the right, else 0: a shadow that only then falls beyond the way's end."""
+        """Return the length if the way leads to the right, else 0: a shadow that only then falls beyond the way's
+        end.
+        """
         return length if self.direction > 0 else 0.0
 
     def cover(self, along: Span, across: Span, high: float) -> Box:
-        """What the panel must hide of things that are up to `high`, their shadows included."""
+        """Return what the panel must hide of things that are up to `high`, their shadows included."""
         right = SHADOW_RIGHT * high if self.direction > 0 else 0.01
         return self.box(along, (across[0], across[1] + SHADOW_BACK * high), (0, high), left=0.01, right=right)
 
@@ -427,7 +432,7 @@ class Course:
         colours: Sequence[str] = (),
         shown_by: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> Scene:
-        """The built scene.
+        """Return the built scene.
 
         decisive, hidden, cover, in_view: `kit.Scene` (there, in_view is `framed`). things: phrases that single out one
         thing in view, each ends in its noun ('red ball'). also: further nouns in view. colours: those in view that no
@@ -454,12 +459,12 @@ class Course:
 
 
 def coloured(p: Any) -> dict[str, str]:
-    """Part -> its colour, from the fields `<part>_colour` of the parameters."""
+    """Return part -> its colour, from the fields `<part>_colour` of the parameters."""
     names = [each.name for each in fields(p) if each.name.endswith("_colour")]
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}
 
 
 def _along(points: Any, axis: np.ndarray) -> np.ndarray:
-    """How far points (..., 3) lie along an axis (3,). These numbers go into the model as they are, so they are added in
-    one order: the last bit of a product of matrices is another one on another CPU."""
+    """Return how far points (..., 3) lie along an axis (3,). These numbers go into the model as they are, so they are
+    added in one order: the last bit of a product of matrices is another one on another CPU."""
     return (np.asarray(points) * axis).sum(axis=-1)

@@ -53,7 +53,7 @@ def add_rows(
     plank_colour: str,
     speed_m_s: float,
 ) -> Span:
-    """Plank, balls, both rows and the posts. Returns where the covered part of the way begins and ends (m).
+    """Return plank, balls, both rows and the posts. Returns where the covered part of the way begins and ends (m).
 
     first: the colours of the first row, whose bodies are `domino_0` and so on. places: how many spacings the second row
     is long. speed_m_s: of the ball that sets all off.
@@ -82,7 +82,7 @@ def add_rows(
 
 
 def add_domino(course: Course, size: Size, domino: Standing, row_at: float) -> None:
-    """A free domino (body and geom of its name) of a row that begins at `row_at`."""
+    """Add a free domino (body and geom of its name) of a row that begins at `row_at`."""
     h = size.height_m
     x = (row_at + domino.place * size.spacing) * h
     at = (x, h * (size.width + 0.10), size.thickness * h / 2) if domino.aside else (x, 0.0, (PLANK + 0.5) * h)
@@ -93,7 +93,7 @@ def add_domino(course: Course, size: Size, domino: Standing, row_at: float) -> N
 
 
 def cover(course: Course, size: Size, along: Span, back: float) -> Box:
-    """What the panel must hide of the covered part, which reaches to the back by so many heights; whatever a gap
+    """Return what the panel must hide of the covered part, which reaches to the back by so many heights; whatever a gap
     changes casts its shadow behind the panel too."""
     h = size.height_m
     across = (-h * (size.width / 2 + 0.10), h * back)
@@ -101,6 +101,6 @@ def cover(course: Course, size: Size, along: Span, back: float) -> Box:
 
 
 def in_view(course: Course, size: Size, along: Span, back: float) -> Box:
-    """What the camera must see of the covered part."""
+    """Return what the camera must see of the covered part."""
     h = size.height_m
     return course.box(along, (-h * (size.width / 2 + 0.10), h * back), (0, (PLANK + 1.0) * h))

@@ -39,7 +39,7 @@ def scene_family(
     perturbation: float = 1e-4,
     looks: tuple[str, ...] | None = None,
 ) -> Family:
-    """A family from its parts; `kit.Family` says what the other fields mean.
+    """Return a family from its parts; `kit.Family` says what the other fields mean.
 
     Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
     chaotic family. observe: what is seen of the outcome. foresee: what follows from the frames before a panel, where
@@ -62,10 +62,10 @@ def scene_family(
         if foresee is not None and len(shown) < len(frames):
             at_rest = still(shown) or still(shown[:-1])  # the shadow of a panel may come before it does
             return _first(unflagged, named, (observe, foresee) if at_rest else (foresee, observe))
-        said = observe(unflagged, named)
-        if said is None and look is not None and len(end := after_panel(unflagged)) < len(unflagged):
+        answer = observe(unflagged, named)
+        if answer is None and look is not None and len(end := after_panel(unflagged)) < len(unflagged):
             return look(end, named)
-        return said
+        return answer
 
     params = with_look(params)
     return Family(
@@ -92,5 +92,5 @@ def scene_family(
 
 
 def _first(frames: np.ndarray, named: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
-    """The answer of the first observer that has one."""
+    """Return the answer of the first observer that has one."""
     return next((said for observe in observers if (said := observe(frames, named)) is not None), None)

@@ -29,8 +29,8 @@ TEXELS = 256  # of a side of the texture, which shows one repeat of the pattern
 
 
 def floors(tones: Sequence[str] = tuple(TONES)) -> Group:
-    """Of some tones, the fields `floor_pattern`, `floor_tones` (two), `floor_repeat_m` (from one repeat to the next),
-    `floor_turn_deg` and `floor_shift_m` (along both sides of the pattern)."""
+    """Return of some tones, the fields `floor_pattern`, `floor_tones` (two), `floor_repeat_m` (from one repeat to the
+    next), `floor_turn_deg` and `floor_shift_m` (along both sides of the pattern)."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[str, tuple[str, ...], float, float, tuple[float, ...]]:
         pattern = PATTERNS[int(rng.integers(len(PATTERNS)))] if rng.random() > PLAIN_SHARE else "plain"
@@ -62,7 +62,8 @@ def lay(spec: mujoco.MjSpec, p: Any) -> None:
 
 
 def _shares(pattern: str) -> np.ndarray:
-    """How much of the second tone each texel has, (TEXELS, TEXELS) in [0, 1]. Raises ValueError for another pattern."""
+    """Return how much of the second tone each texel has, (TEXELS, TEXELS) in [0, 1]. Raises ValueError for another
+    pattern."""
     down, right = np.mgrid[:TEXELS, :TEXELS] / TEXELS
     match pattern:
         case "plain":

@@ -21,7 +21,7 @@ LEAST_EXPECTED = 5  # draws of each world in a row of a table; rarer values shar
 
 
 def dependence(family: Family) -> str | None:
-    """How the hidden element goes with what is seen: '`rough` goes with `direction`'; None if it does not."""
+    """Return how the hidden element goes with what is seen: '`rough` goes with `direction`'; None if it does not."""
     if family.twins is None:
         return None
     scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]
@@ -45,32 +45,32 @@ def dependence(family: Family) -> str | None:
 
 
 def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
-    """A scene and its twins, their twins and so on, each once: all that may be behind the panel."""
+    """Return a scene and its twins, their twins and so on, each once: all that may be behind the panel."""
     assert family.twins is not None
-    found, waiting = [], [params]
-    while waiting and len(found) < MOST_WORLDS:
+    worlds, waiting = [], [params]
+    while waiting and len(worlds) < MOST_WORLDS:
         world = waiting.pop(0)
-        if world not in found:
-            found.append(world)
+        if world not in worlds:
+            worlds.append(world)
             waiting += family.twins(world)
-    return [params_to_dict(world) for world in found]
+    return [params_to_dict(world) for world in worlds]
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Numbers and names by where they stand: tuples by length and place."""
-    found: dict[str, Any] = {}
+    """Return numbers and names by where they stand: tuples by length and place."""
+    fields: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, list | tuple):
-            found[f"len({prefix}{name})"] = len(value)
-            found |= _flat({f"{name}[{i}]": item for i, item in enumerate(value)}, prefix)
+            fields[f"len({prefix}{name})"] = len(value)
+            fields |= _flat({f"{name}[{i}]": item for i, item in enumerate(value)}, prefix)
         else:
-            found[prefix + name] = value
-    return found
+            fields[prefix + name] = value
+    return fields
 
 
 def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     """For every parameter that varies, the row that each scene falls into: its value, or the quarter that holds it."""
-    found = {}
+    columns = {}
     for name in sorted(set().union(*scenes)):
         values = [scene.get(name) for scene in scenes]
         distinct = sorted(set(values), key=repr)
@@ -80,18 +80,18 @@ def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
         else:
             rows = np.array([distinct.index(value) for value in values])
         if rows.any():
-            found[name] = rows
-    return found
+            columns[name] = rows
+    return columns
 
 
 def _pooled(rows: np.ndarray, least: int) -> np.ndarray:
-    """Rows from 0 on, those with fewer scenes than `least` in one."""
+    """Return rows from 0 on, those with fewer scenes than `least` in one."""
     _, rows, counts = np.unique(rows, return_inverse=True, return_counts=True)
     return np.unique(np.where(counts[rows] < least, -1, rows), return_inverse=True)[1]
 
 
 def _goes_together(worlds: np.ndarray, rows: np.ndarray) -> bool:
-    """Pearson's chi-square test of a table of counts."""
+    """Return Pearson's chi-square test of a table of counts."""
     from scipy.special import chdtrc
 
     table = np.zeros((worlds.max() + 1, rows.max() + 1))

@@ -69,7 +69,8 @@ class Look:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> Look:
-        """The look in a record's parameters. Raises ValueError for an unknown field, tone, panel, material or size."""
+        """Return the look in a record's parameters. Raises ValueError for an unknown field, tone, panel, material or
+        size."""
         try:
             look = Look(**{name: _tuples(value) for name, value in record.items()})
         except TypeError as error:
@@ -86,12 +87,12 @@ class Look:
 
 
 def look_of_draw(seed: int, family: str, number: int, parts: Collection[str]) -> Look | None:
-    """The look of a numbered draw of a family, whatever else is drawn of it."""
+    """Return the look of a numbered draw of a family, whatever else is drawn of it."""
     return draw_look(np.random.default_rng([seed, *family.encode(), number, *b"look"]), parts)
 
 
 def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
-    """A look that varies in these parts (of `PARTS`); None if there are none."""
+    """Return a look that varies in these parts (of `PARTS`); None if there are none."""
     if not parts:
         return None
     drawn: dict[str, Any] = {}
@@ -124,7 +125,7 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
 
 
 def with_look(params: type) -> type:
-    """The same parameters with a last field `look`, which no family draws."""
+    """Return the same parameters with a last field `look`, which no family draws."""
     looked = field(default=None, metadata={READ: lambda value: None if value is None else Look.from_record(value)})
     named = make_dataclass(params.__name__, [("look", Look | None, looked)], bases=(params,), frozen=True)
     named.__module__, named.__doc__ = params.__module__, params.__doc__
@@ -132,18 +133,18 @@ def with_look(params: type) -> type:
 
 
 def look_of(params: Any) -> Look | None:
-    """The look of a scene's parameters, None if they have none."""
+    """Return the look of a scene's parameters, None if they have none."""
     return getattr(params, "look", None)
 
 
 def fineness(params: Any) -> int:
-    """How many times as fine as 480x360 the frames of a scene are."""
+    """Return how many times as fine as 480x360 the frames of a scene are."""
     look = look_of(params)
     return 1 if look is None else SIZES[look.size]
 
 
 def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
-    """Width and height (px) of the clips of a record, from its parameters."""
+    """Return width and height (px) of the clips of a record, from its parameters."""
     look = record.get("look")
     fine = 1 if look is None else SIZES[Look.from_record(look).size]
     return WIDTH * fine, HEIGHT * fine
@@ -178,7 +179,7 @@ def paint_panels(spec: mujoco.MjSpec, panels: Sequence[mujoco.MjsGeom], params: 
 
 
 def dressed(scene: Scene, look: Look | None) -> Scene:
-    """A built scene with its look."""
+    """Return a built scene with its look."""
     if look is None:
         return scene
     if look.floor_pattern is not None:
@@ -204,7 +205,7 @@ def _light(scene: Scene, look: Look) -> None:
 
 
 def _add_bystanders(scene: Scene, look: Look) -> None:
-    """Boxes on the floor behind everything, which nothing touches."""
+    """Add boxes on the floor behind everything, which nothing touches."""
     import mujoco
 
     corners = np.concatenate([box.corners() for box in (*scene.framed, *([scene.cover] if scene.cover else []))])

@@ -32,14 +32,14 @@ LOST = 2  # for so many frames a moving thing may be out of sight
 
 
 def small(frame: np.ndarray, colour: str) -> Blob | None:
-    """The largest region of a colour that is no longer than a ball (80 px)."""
+    """Return the largest region of a colour that is no longer than a ball (80 px)."""
     return next((blob for blob in blobs(colour_mask(frame, colour), 60) if max(blob.box[2:]) < 80), None)
 
 
 def compact(
     frame: np.ndarray, colour: str, *, area: int = 4000, shape: tuple[float, float] = (0.4, 2.5), fill: float = 0.5
 ) -> Blob | None:
-    """The largest region of a colour that may be a ball: filled, about as wide as high, small beside the frame.
+    """Return the largest region of a colour that may be a ball: filled, about as wide as high, small beside the frame.
 
     area: at most so many pixels. shape: width over height, between. fill: least share of its bounding box.
     """
@@ -50,18 +50,18 @@ def compact(
 
 
 def offered(named: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
-    """The choices that the question offers, or these where it offers none."""
+    """Return the choices that the question offers, or these where it offers none."""
     return choices_in(named["choices"]) if "choices" in named else otherwise
 
 
 def colours_of_balls(frames: np.ndarray, named: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
-    """The colours that the question offers; where it offers none, those of the pool that a ball has at first."""
+    """Return the colours that the question offers; where it offers none, those of the pool that a ball has at first."""
     seen = [colour for colour in pool if sum(compact(frame, colour) is not None for frame in frames[:3]) >= 2]
     return offered(named, seen)
 
 
 def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
-    """The largest region of a colour that may be a ball: neither as large nor as rectangular as a panel.
+    """Return the largest region of a colour that may be a ball: neither as large nor as rectangular as a panel.
 
     fill: greatest share of its bounding box. longer: how many times as long as it is wide, at most.
     """
@@ -72,7 +72,7 @@ def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float 
 
 
 def upper_half_stays(frames: np.ndarray, colour: str, first: Blob) -> bool:
-    """Whether the upper half of a thing that the first frame shows is still where it was in the last frame."""
+    """Return whether the upper half of a thing that the first frame shows is still where it was in the last frame."""
     x, y, width, height = first.box
     part = np.s_[y : y + height // 2, x : x + width]
     before, after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
@@ -83,15 +83,15 @@ def upper_half_stays(frames: np.ndarray, colour: str, first: Blob) -> bool:
 
 
 def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
-    """The thing where it rests, None while it does not rest; with `ahead`, where it is so many frames later."""
+    """Return the thing where it rests, None while it does not rest; with `ahead`, where it is so many frames later."""
     if ahead is not None:
         return carried_on(path, ahead)
     return path[-1] if at_rest(path, tolerance_px=tolerance_px) else None
 
 
 def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
-    """The thing so many frames after the last one, if it goes on as it was seen to move last; None if it has been out
-    of sight for longer than LOST frames."""
+    """Return the thing so many frames after the last one, if it goes on as it was seen to move last; None if it has
+    been out of sight for longer than LOST frames."""
     seen = [(at, blob) for at, blob in enumerate(path) if blob is not None]
     if not seen or len(path) - 1 - seen[-1][0] > LOST:
         return None
@@ -106,12 +106,12 @@ def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
 
 
 def struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
-    """Whether in the last step much moved at a thing, or so near it (in its longer sides)."""
+    """Return whether in the last step much moved at a thing, or so near it (in its longer sides)."""
     return bool(moved(frames)[around(thing, reach)].sum() > STRUCK * thing.area)
 
 
 def around(thing: Blob, reach: float) -> tuple[slice, slice]:
-    """The part of a frame that a thing is in, with so much around it (in its longer sides)."""
+    """Return the part of a frame that a thing is in, with so much around it (in its longer sides)."""
     x, y, width, height = thing.box
     beside = round(reach * max(width, height))
     return slice(max(0, y - beside), y + height + beside), slice(max(0, x - beside), x + width + beside)
@@ -121,7 +121,7 @@ def around(thing: Blob, reach: float) -> tuple[slice, slice]:
 
 
 def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
-    """'yes' if the thing rests on the far side of the mark, seen from where it was first, else 'no'."""
+    """Return 'yes' if the thing rests on the far side of the mark, seen from where it was first, else 'no'."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path, line = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
@@ -134,7 +134,9 @@ def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
 
 
 def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observer:
-    """'yes' if the thing rests past that edge of the screen which is farther from where it was first, else 'no'."""
+    """Return 'yes' if the thing rests past that edge of the screen which is farther from where it was first, else
+    'no'.
+    """
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = [small(frame, named[thing]) for frame in frames]
@@ -149,7 +151,7 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
 
 
 def rests_over(thing: str, goal: str, find: Finder = compact, ahead: float | None = None) -> Observer:
-    """'yes' if the thing rests within the goal from left to right (2 px more to either side), else 'no'."""
+    """Return 'yes' if the thing rests within the goal from left to right (2 px more to either side), else 'no'."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = [find(frame, named[thing]) for frame in frames]
@@ -172,8 +174,8 @@ def nearer_side(
     tolerance_px: float = 1.5,
     ahead: float | None = None,
 ) -> Observer:
-    """'left' or 'right': which of two marks the resting thing is nearer to. left, right: what the question names, or
-    colours; least: of the marks (pixels)."""
+    """Return 'left' or 'right': which of two marks the resting thing is nearer to. left, right: what the question
+    names, or colours; least: of the marks (pixels)."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = [find(frame, named[thing]) for frame in frames[-3:]]
@@ -187,7 +189,7 @@ def nearer_side(
 
 
 def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | None = None) -> Observer:
-    """'yes' if the thing rests nearer to the middle of the goal than to where it was first, else 'no'.
+    """Return 'yes' if the thing rests nearer to the middle of the goal than to where it was first, else 'no'.
 
     foot: which share of the thing's height, from its top, stands for its place; None takes its middle.
     """
@@ -207,7 +209,7 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
 
 
 def has_fallen(thing: str) -> Observer:
-    """'yes' if the thing, once at rest, no longer stands where it stood at first, else 'no'."""
+    """Return 'yes' if the thing, once at rest, no longer stands where it stood at first, else 'no'."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = track(frames, named[thing], 60)
@@ -219,8 +221,8 @@ def has_fallen(thing: str) -> Observer:
 
 
 def has_begun(thing: str, reach: float) -> Observer:
-    """'yes' if the thing has left the place where it was first, or is about to: what moves is so near it (in its longer
-    sides), else 'no'."""
+    """Return 'yes' if the thing has left the place where it was first, or is about to: what moves is so near it (in its
+    longer sides), else 'no'."""
 
     def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         first, last = largest(frames[0], named[thing], 60), largest(frames[-1], named[thing], 60)
@@ -235,7 +237,9 @@ def has_begun(thing: str, reach: float) -> Observer:
 
 
 def will_clear(thing: str, mark: str) -> Observer:
-    """'yes' if the thing is beyond the mark, or flies over its upper edge when it goes on as it does, else 'no'."""
+    """Return 'yes' if the thing is beyond the mark, or flies over its upper edge when it goes on as it does, else
+    'no'.
+    """
 
     def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path, wall = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
@@ -255,7 +259,7 @@ def will_clear(thing: str, mark: str) -> Observer:
 
 
 def lies_on(thing: str, goal: str) -> Observer:
-    """'yes' if the thing rests between the left and the right end of all that is seen of the goal, else 'no'."""
+    """Return 'yes' if the thing rests between the left and the right end of all that is seen of the goal, else 'no'."""
 
     def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         end = end_of(track(frames, named[thing], 60))
@@ -269,7 +273,7 @@ def lies_on(thing: str, goal: str) -> Observer:
 
 
 def lies_flat(thing: str) -> Observer:
-    """'yes' if the thing that should stand rests and is wider than high, 'no' if it is higher."""
+    """Return 'yes' if the thing that should stand rests and is wider than high, 'no' if it is higher."""
 
     def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         end = end_of(track(frames, named[thing], 60))

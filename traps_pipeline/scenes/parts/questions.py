@@ -41,13 +41,15 @@ class Question:
     fill: Callable[[Any, np.random.Generator], Filled]
 
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
-        """The words of a scenario: one wording of the question, one of the asides; a sole aside costs no draw."""
+        """Return the words of a scenario: one wording of the question, one of the asides; a sole aside costs no
+        draw.
+        """
         filled = self.fill(p, rng)
         text = str(rng.choice(self.templates)).format_map({**coloured(p), **filled.fills})
         return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
 
     def named_in(self, question: str) -> dict[str, str] | None:
-        """What a question, read back, has in its placeholders; None if it is not this question."""
+        """Return what a question, read back, has in its placeholders; None if it is not this question."""
         return asked(self.templates, question)
 
 
@@ -64,15 +66,15 @@ def yes_no(
     no: Forms,
     fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
 ) -> Question:
-    """A question that is answered by yes or no, and other ways to say either. fills: what its placeholders that are no
-    part become."""
+    """Return a question that is answered by yes or no, and other ways to say either. fills: what its placeholders that
+    are no part become."""
     aliases = dict.fromkeys(yes, "yes") | dict.fromkeys(no, "no")
     return Question("binary", templates, lambda p, rng: Filled(("yes", "no"), aliases, fills(p, rng)))
 
 
 def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[str, str]] | None = None) -> Question:
-    """A question that is answered by left or right. forms: other ways to say a side; '{0}' is the side and '{1}' its
-    colour, which `colours(p)` gives for left and right."""
+    """Return a question that is answered by left or right. forms: other ways to say a side; '{0}' is the side and '{1}'
+    its colour, which `colours(p)` gives for left and right."""
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         of_sides = ("", "") if colours is None else colours(p)
@@ -88,8 +90,8 @@ def which_colour(
     forms: Forms,
     also: Mapping[str, str] = MappingProxyType({}),
 ) -> Question:
-    """A question that is answered by one of some colours, '{choices}' in random order. forms: ways to say a colour.
-    also: other names of colours -> the colour."""
+    """Return a question that is answered by one of some colours, '{choices}' in random order. forms: ways to say a
+    colour. also: other names of colours -> the colour."""
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         choices = tuple(str(c) for c in rng.permutation(colours(p)))
@@ -103,7 +105,7 @@ NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
 
 
 def range_of(ranges: Sequence[Sequence[int]], count: int) -> str | None:
-    """The choice '<lowest>-<highest>' that a count belongs to, None if it belongs to none."""
+    """Return the choice '<lowest>-<highest>' that a count belongs to, None if it belongs to none."""
     return next((f"{low}-{high}" for low, high in ranges if low <= count <= high), None)
 
 
@@ -112,8 +114,8 @@ def how_many(
     ranges: Callable[[Any], Sequence[tuple[int, int]]],
     fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
 ) -> Question:
-    """A question that is answered by a range of numbers; its '{choices}' are all ranges, lowest first. fills: as in
-    `yes_no`."""
+    """Return a question that is answered by a range of numbers; its '{choices}' are all ranges, lowest first. fills: as
+    in `yes_no`."""
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         aliases: dict[str, str] = {}
@@ -130,7 +132,7 @@ def how_many(
 
 
 def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -> Aside:
-    """A question that names its choices in a fixed order: 'Are the pegs round or square?'. It may name parts."""
+    """Return a question that names its choices in a fixed order: 'Are the pegs round or square?'. It may name parts."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         return AnswerableQuestion(question.format_map(coloured(p)), tuple(labels), answer(p))
@@ -139,17 +141,17 @@ def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -
 
 
 def comes_from(question: str) -> Aside:
-    """A question after the side, left or right, that things come from."""
+    """Return a question after the side, left or right, that things come from."""
     return either(question, ("left", "right"), lambda p: "left" if p.direction > 0 else "right")
 
 
 def goes_to(question: str) -> Aside:
-    """A question after the side, left or right, that things go to."""
+    """Return a question after the side, left or right, that things go to."""
     return either(question, ("left", "right"), lambda p: "right" if p.direction > 0 else "left")
 
 
 def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Callable[[Any], str]) -> Aside:
-    """A question whose '{choices}' are in random order."""
+    """Return a question whose '{choices}' are in random order."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         shown = tuple(str(c) for c in rng.permutation(choices(p)))
@@ -159,13 +161,14 @@ def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Ca
 
 
 def colour_of(part: str, question: str, among: Sequence[str]) -> Aside:
-    """A question after the colour of a part; its '{choices}' are the colours of the parts `among`, itself included."""
+    """Return a question after the colour of a part; its '{choices}' are the colours of the parts `among`, itself
+    included."""
     return choice_of(question, lambda p: [coloured(p)[one] for one in among], lambda p: coloured(p)[part])
 
 
 def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[str]) -> Aside:
-    """A question after the colour of a part; its '{choices}' are that and two of the pool that no part of `unlike`
-    has."""
+    """Return a question after the colour of a part; its '{choices}' are that and two of the pool that no part of
+    `unlike` has."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         colours = coloured(p)
@@ -180,5 +183,7 @@ _IN_WORDS = {"wood": "brown", "grey": "grey", "black": "black"}
 
 
 def material_of(part: str, question: str) -> Aside:
-    """A question after the colour of a part of wood, grey or black; its '{choices}' are brown, grey and black."""
+    """Return a question after the colour of a part of wood, grey or black; its '{choices}' are brown, grey and
+    black.
+    """
     return choice_of(question, lambda p: list(_IN_WORDS.values()), lambda p: _IN_WORDS[coloured(p)[part]])

@@ -35,7 +35,7 @@ class Ramp:
         return float(np.radians(self.slope_deg))
 
     def at(self, up: float, over: float = 0.0, aside: float = 0.0) -> Vec3:
-        """A place by the slope, as a course takes it."""
+        """Return a place by the slope, as a course takes it."""
         sin, cos = float(np.sin(self.slope_rad)), float(np.cos(self.slope_rad))
         away, high = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
         return (self.middle_m + aside, away, high) if self.towards_camera else (-away, aside, high)
@@ -51,7 +51,8 @@ class Ramp:
         *,
         aside: float = 0.0,
     ) -> mujoco.MjsGeom:
-        """A box that lies on the slope, its middle at a place. half: half sizes up the slope, across it, out of it."""
+        """Return a box that lies on the slope, its middle at a place. half: half sizes up the slope, across it, out of
+        it."""
         centre = self.at(up, over, aside)
         if not self.towards_camera:
             return course.slab(name, centre, half, colour, falls_rad=self.slope_rad)
@@ -78,13 +79,13 @@ class SteppedRamp:
     height_m: float
 
     def at(self, along: float, over: float = 0.0) -> Vec3:
-        """The place so far along the way, and from the surface there so far out of it."""
+        """Return the place so far along the way, and from the surface there so far out of it."""
         slope = np.radians(self.slope_deg)
         high = self.height_m + (self.length_m - along) * np.tan(slope)
         return (float(along + over * np.sin(slope)), 0.0, float(high + over * np.cos(slope)))
 
     def add(self, course: Course, half_width: float, colour: str) -> mujoco.MjsGeom:
-        """The board `ramp`, which is returned, and the `prop` under its upper end."""
+        """Return the board `ramp`, which is returned, and the `prop` under its upper end."""
         slope, half_thick = np.radians(self.slope_deg), 0.012
         half = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
         ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))

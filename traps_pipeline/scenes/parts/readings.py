@@ -19,13 +19,13 @@ Labels = list[str | None]
 
 
 def lasting_from(holds: np.ndarray) -> int:
-    """The first frame from which `holds` (F,) is true to the end; F if it is not true at the end."""
+    """Return the first frame from which `holds` (F,) is true to the end; F if it is not true at the end."""
     broken = np.flatnonzero(~holds)
     return int(broken[-1]) + 1 if broken.size else 0
 
 
 def still_from(*paths: np.ndarray, within_m: float) -> int:
-    """The first frame from which all paths stay within so many metres of where they end.
+    """Return the first frame from which all paths stay within so many metres of where they end.
 
     A path is (F,), a place along a line, or (F, ..., 3), places in space.
     """
@@ -35,8 +35,8 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
 
 
 def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
-    """How far (m) a thing ends past a line, `past` (F,) m above 0, or how far its front, so much ahead of its middle,
-    ends before the line."""
+    """Return how far (m) a thing ends past a line, `past` (F,) m above 0, or how far its front, so much ahead of its
+    middle, ends before the line."""
     return float(past[-1] if past[-1] > 0 else -past[-1] - before_m)
 
 
@@ -49,12 +49,14 @@ def undecided(motion: Motion) -> Labels:
 
 
 def held_from(first: int, label: str, motion: Motion) -> Labels:
-    """One label, from a frame on."""
+    """Return one label, from a frame on."""
     return [label if i >= first else None for i in range(len(motion.times))]
 
 
 def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = True) -> Labels:
-    """'yes' while `holds` (F,); 'no' while it does not, from frame `no_from` on and only where `no_where` (F,)."""
+    """Return 'yes' while `holds` (F,); 'no' while it does not, from frame `no_from` on and only where `no_where`
+    (F,).
+    """
     no_where = np.broadcast_to(no_where, holds.shape)
     return [
         "yes" if yes else "no" if i >= no_from and no else None
@@ -63,12 +65,12 @@ def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = Tru
 
 
 def side_while(valid: np.ndarray, past: np.ndarray, over: str = "yes", under: str = "no") -> Labels:
-    """`over` where `past` (F,) is above 0 and `under` elsewhere, in the frames where `valid` (F,)."""
+    """Return `over` where `past` (F,) is above 0 and `under` elsewhere, in the frames where `valid` (F,)."""
     return [(over if x > 0 else under) if counts else None for x, counts in zip(past, valid, strict=True)]
 
 
 def crossed(past: np.ndarray, valid: np.ndarray | bool = True) -> Reading:
-    """'yes' if `past` (F,) m ends above 0, else 'no': from when it is `valid` and on that side to the end.
+    """Return 'yes' if `past` (F,) m ends above 0, else 'no': from when it is `valid` and on that side to the end.
 
     The margin is how far from 0 it ends.
     """
@@ -78,7 +80,8 @@ def crossed(past: np.ndarray, valid: np.ndarray | bool = True) -> Reading:
 
 
 def came_through(rear_past: np.ndarray, radius_m: float) -> Reading:
-    """'yes' from when the rear of a ball is out, `rear_past` (F,) m above 0; 'no' from when it stays where it ends.
+    """Return 'yes' from when the rear of a ball is out, `rear_past` (F,) m above 0; 'no' from when it stays where it
+    ends.
 
     The margin is how far the ball ends out, or how far its front is from coming out.
     """
@@ -90,7 +93,7 @@ def came_through(rear_past: np.ndarray, radius_m: float) -> Reading:
 
 
 def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead_s: float) -> Reading:
-    """Who is first past the line: `ahead` (F, N) m above 0, one column a name.
+    """Return who is first past the line: `ahead` (F, N) m above 0, one column a name.
 
     No reading at all if somebody never gets past or the lead is below `min_lead_s`. The margin is how far the second
     still is from the line when the first is past it.
@@ -107,12 +110,12 @@ def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead
 
 
 def top_m(motion: Motion, body: str, height_m: float, floor_m: float = 0.0) -> np.ndarray:
-    """Height over a floor of the middle of a standing or fallen body's top (m), shape (F,)."""
+    """Return height over a floor of the middle of a standing or fallen body's top (m), shape (F,)."""
     return motion.pos(body)[:, 2] - floor_m + motion.rot(body)[:, 2, 2] * height_m / 2
 
 
 def turns_deg(rotations: np.ndarray) -> float:
-    """How far (degrees) a body is turned, in the frame where it is most, from how it stands at first. rotations: its
-    matrices, (F, 3, 3)."""
+    """Return how far (degrees) a body is turned, in the frame where it is most, from how it stands at first. rotations:
+    its matrices, (F, 3, 3)."""
     traces = np.einsum("fij,ij->f", rotations, rotations[0])
     return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))

@@ -33,7 +33,7 @@ def rope(
     sliding: float = 0.6,
     drag: float = 0.1,
 ) -> mujoco.MjsFlex:
-    """A rope that lies straight along the way at the start and does not stretch.
+    """Return a rope that lies straight along the way at the start and does not stretch.
 
     thrown: speeds along and up (m/s). links: of which it is made, each longer than the rope is thick. sliding:
     friction, no unit. drag: viscosity of the air (Pa s).
@@ -60,7 +60,7 @@ def hammock(
     sliding: float = 0.6,
     drag: float = 0.1,
 ) -> mujoco.MjsFlex:
-    """A cloth that hangs through between its ends and does not stretch; its corners are where it is tied.
+    """Return a cloth that hangs through between its ends and does not stretch; its corners are where it is tied.
 
     middle: between its four corners. size, cells: along and across, in metres and in pieces. sag: how far (m) its
     middle hangs below. tied: at which ends: -1 is the near one along the way, 1 the far one. thick: half of its
@@ -94,7 +94,8 @@ def soft_ball(
     sliding: float = 0.3,
     pieces: int = 6,
 ) -> mujoco.MjsFlex:
-    """A ball that can be squeezed. young: its stiffness (Pa). pieces: of a diameter. It bends as one (quadratic)."""
+    """Return a ball that can be squeezed. young: its stiffness (Pa). pieces: of a diameter. It bends as one
+    (quadratic)."""
     _settle(pieces)
     skin = 0.004
     spacing = (2 * (radius - skin) / pieces,) * 3
@@ -155,5 +156,5 @@ def _flex(
 
 
 def _vertices(course: Course, name: str) -> list[mujoco.MjsBody]:
-    """The bodies that carry a rope or a cloth, one a vertex."""
+    """Return the bodies that carry a rope or a cloth, one a vertex."""
     return [body for body in course.spec.worldbody.bodies if body.name.rpartition("_")[0] == name]

@@ -39,7 +39,7 @@ _RANGE, _VALUES = "range", "values"  # what is drawn: bounds of a number, or all
 
 
 def drawn_by(draw: Draw, **what: Any) -> Any:
-    """A field that `draw(rng, so_far)` draws, for what no other function here says.
+    """Return a field that `draw(rng, so_far)` draws, for what no other function here says.
 
     `so_far` holds the fields above by name. `draw` may put further values into it for fields below: those are not
     stored with the parameters. what: for `check`, the bounds (`range`) or the possible values (`values`).
@@ -48,19 +48,21 @@ def drawn_by(draw: Draw, **what: Any) -> Any:
 
 
 def between(low: float, high: float) -> Any:
-    """A float between two bounds, rounded to 0.0001."""
+    """Return a float between two bounds, rounded to 0.0001."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high), range=(low, high))
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
-    """A tuple of floats between two bounds. count: how many, or the name of the drawn value that says how many."""
+    """Return a tuple of floats between two bounds. count: how many, or the name of the drawn value that says how
+    many.
+    """
     return drawn_by(
         lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
     )
 
 
 def one_of(*values: Any) -> Any:
-    """One of these values, each as often. Names of colours, -1 and 1, counts: `one_of(4, 5, 6)`."""
+    """Return one of these values, each as often. Names of colours, -1 and 1, counts: `one_of(4, 5, 6)`."""
     return drawn_by(lambda rng, so_far: values[int(rng.integers(len(values)))], values=values)
 
 
@@ -70,13 +72,13 @@ def chance(share: float) -> Any:
 
 
 def facing(low: float, high: float) -> Any:
-    """Azimuth (degrees) of a camera in front of the scene that stands by so many degrees, between two bounds, towards
-    the side that things come from. Needs a field `direction` above it."""
+    """Return azimuth (degrees) of a camera in front of the scene that stands by so many degrees, between two bounds,
+    towards the side that things come from. Needs a field `direction` above it."""
     return drawn_by(lambda rng, so_far: 90 - so_far["direction"] * uniform(rng, low, high))
 
 
 def in_front(low: float, high: float) -> Any:
-    """Azimuth (degrees) of a camera in front of the scene, turned by so many degrees whatever the direction."""
+    """Return azimuth (degrees) of a camera in front of the scene, turned by so many degrees whatever the direction."""
     return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high))
 
 
@@ -94,13 +96,13 @@ class Group:
     values: tuple[Any, ...] | None = None  # all that it draws from, where that can be said
 
     def __call__(self, count: Count | None = None) -> Any:
-        """A field with one value of the group, or with a tuple of `count` of them: a number, the name of the drawn
-        value that says how many, or a function of the fields above."""
+        """Return a field with one value of the group, or with a tuple of `count` of them: a number, the name of the
+        drawn value that says how many, or a function of the fields above."""
         return field(metadata={_HOW: self, _COUNT: count, _VALUES: self.values})
 
 
 def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
-    """Colours of a pool that are not easily taken for each other; drawn again until `fits(*colours)`."""
+    """Return colours of a pool that are not easily taken for each other; drawn again until `fits(*colours)`."""
 
     def draw(rng: np.random.Generator, so_far: Drawn, count: int) -> Sequence[str]:
         while True:
@@ -122,7 +124,7 @@ def shuffled(*values: Any, without: str | None = None) -> Group:
 
 
 def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Group:
-    """Fields whose values `draw(rng, so_far)` gives all at once, in the order of the fields."""
+    """Return fields whose values `draw(rng, so_far)` gives all at once, in the order of the fields."""
     return Group(lambda rng, so_far, count: draw(rng, so_far))
 
 
@@ -130,12 +132,12 @@ def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Gro
 
 
 def hidden(*values: Any) -> Any:
-    """The hidden element: one of these values, each as often, whatever else is drawn. Twins have the others."""
+    """Return the hidden element: one of these values, each as often, whatever else is drawn. Twins have the others."""
     return _hidden(lambda so_far: values)
 
 
 def hidden_index(of: str) -> Any:
-    """The hidden element as a place in the tuple that the field `of` has (which lane, which sector)."""
+    """Return the hidden element as a place in the tuple that the field `of` has (which lane, which sector)."""
     return _hidden(lambda so_far: range(len(so_far[of])))
 
 
@@ -156,7 +158,7 @@ def hidden_field(params: type) -> str | None:
 
 
 def twins(p: Any) -> list[Any]:
-    """The same scene with every other value of its hidden element. Raises TypeError if it has none."""
+    """Return the same scene with every other value of its hidden element. Raises TypeError if it has none."""
     name = hidden_field(type(p))
     if name is None:
         raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
@@ -168,7 +170,7 @@ def twins(p: Any) -> list[Any]:
 
 
 def check(p: Any) -> None:
-    """Raises ValueError naming the first parameter whose value is not of its type or is far from all that is drawn. A
+    """Raise ValueError naming the first parameter whose value is not of its type or is far from all that is drawn. A
     number may lie outside of its range by the width of the range: a correction may move what a draw would not."""
     types = _types(type(p))
     for each in fields(p):
@@ -200,7 +202,7 @@ def _check_member(p: Any, each: Field[Any], value: Any) -> None:
 
 
 def _members(value: Any) -> list[Any]:
-    """The values in a tuple of tuples, or the value itself."""
+    """Return the values in a tuple of tuples, or the value itself."""
     return [one for each in value for one in _members(each)] if isinstance(value, tuple) else [value]
 
 
@@ -213,8 +215,8 @@ def _shown(value: Any) -> str:
 
 
 def drawn(params: type[Params], rng: np.random.Generator) -> Params:
-    """Parameters of one scenario; a field that has a default keeps it. Raises TypeError naming a field that has neither
-    a range nor a default."""
+    """Return parameters of one scenario; a field that has a default keeps it. Raises TypeError naming a field that has
+    neither a range nor a default."""
     so_far: Drawn = {}
     members = fields(params)  # type: ignore[arg-type]
     for each in members:
@@ -231,15 +233,15 @@ def drawn(params: type[Params], rng: np.random.Generator) -> Params:
 
 
 def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
-    """Values of all fields of a group."""
+    """Return values of all fields of a group."""
     counts = {each.name: each.metadata[_COUNT] for each in members if each.metadata.get(_HOW) is group}
     numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}
     values = list(group.draw(rng, so_far, sum(numbers.values())))
-    found: Drawn = {}
+    values_drawn: Drawn = {}
     for name, number in numbers.items():
         taken, values = values[:number], values[number:]
-        found[name] = taken[0] if counts[name] is None else tuple(taken)
-    return found
+        values_drawn[name] = taken[0] if counts[name] is None else tuple(taken)
+    return values_drawn
 
 
 def _number(count: Count, so_far: Mapping[str, Any]) -> int:

@@ -50,7 +50,7 @@ class Blob:
 
 
 def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
-    """Where a frame has a colour, bool (360, 480), tolerant of shade and of compression."""
+    """Return where a frame has a colour, bool (360, 480), tolerant of shade and of compression."""
     hsv = cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
     hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
     if colour in _HUES:
@@ -72,9 +72,9 @@ def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
 
 
 def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
-    """Connected regions of a mask, largest first."""
+    """Return connected regions of a mask, largest first."""
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    found = [
+    contours = [
         Blob(
             float(centres[i][0]),
             float(centres[i][1]),
@@ -84,30 +84,31 @@ def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
         for i in range(1, count)
         if stats[i][4] >= min_area
     ]
-    return sorted(found, key=lambda blob: -blob.area)
+    return sorted(contours, key=lambda blob: -blob.area)
 
 
 def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
-    """The largest region of a colour, None if the colour is not seen."""
+    """Return the largest region of a colour, None if the colour is not seen."""
     return next(iter(blobs(colour_mask(frame, colour), min_area)), None)
 
 
 def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
-    """The largest region of a colour that cover panels have, in light or shade, with the lines on it."""
-    pixels, found = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
+    """Return the largest region of a colour that cover panels have, in light or shade, with the lines on it."""
+    pixels, mask = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
     for named in PANELS.values():
         colour = np.array(named, np.float32)
         bright = pixels @ colour / (colour @ colour)
         off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
-        found |= (bright > 0.5) & (bright < 1.1) & (off < 0.06 * bright)
+        mask |= (bright > 0.5) & (bright < 1.1) & (off < 0.06 * bright)
     lines = np.ones((9, 9), np.uint8)  # are no wider
-    return next(iter(blobs(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
+    return next(iter(blobs(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
 
 
 def slanting_edges(
     frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where edges in a part of a frame fall to the left and where they fall to the right, bool of the part's shape.
+    """Return where edges in a part of a frame fall to the left and where they fall to the right, bool of the part's
+    shape.
 
     slants: between how many rows a column they fall.
     """
@@ -119,12 +120,12 @@ def slanting_edges(
 
 
 def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
-    """The largest region of a colour in every frame."""
+    """Return the largest region of a colour in every frame."""
     return [largest(frame, colour, min_area) for frame in frames]
 
 
 def before_panel(frames: np.ndarray) -> np.ndarray:
-    """The frames before a panel comes that stands to the end of the clip; all of them if none comes.
+    """Return the frames before a panel comes that stands to the end of the clip; all of them if none comes.
 
     A panel comes in large steps: a large region turns to one colour (but for its shadow), which is not that of what is
     around it, and soon a large region has that colour and keeps it. What stands from the first frame on does not come;
@@ -149,17 +150,20 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
 
 
 def _stands_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
-    """Whether a large region has this colour soon after frame `comes`, and at the end, that had another one before: in
-    the last frame, and some frames ago, when nothing that goes again had covered it."""
+    """Return whether a large region has this colour soon after frame `comes`, and at the end, that had another one
+    before: in the last frame, and some frames ago, when nothing that goes again had covered it."""
     ago, soon = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
     before, was, there, stays = (_apart(frames[at], colour) <= ALIKE for at in (comes - 1, ago, soon, -1))
     stands = stays & ~before & ~was
-    whole = cv2.morphologyEx(stands.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))  # lines between slats
-    return bool(whole.sum() >= PANEL_PX and (there & stands).sum() > 0.9 * stands.sum())
+    closed = cv2.morphologyEx(
+        stands.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
+    )  # lines between slats
+    return bool(closed.sum() >= PANEL_PX and (there & stands).sum() > 0.9 * stands.sum())
 
 
 def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
-    """The first frame in which a panel of a colour is seen on its way, a large part of which comes in frame `comes`."""
+    """Return the first frame in which a panel of a colour is seen on its way, a large part of which comes in frame
+    `comes`."""
     first = comes
     while first > max(1, comes - COMES_FRAMES):
         now, before = (_apart(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
@@ -170,17 +174,17 @@ def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
 
 
 def after_panel(frames: np.ndarray) -> np.ndarray:
-    """The frames after a panel goes that stands from the first one on; all of them if none goes."""
+    """Return the frames after a panel goes that stands from the first one on; all of them if none goes."""
     return before_panel(frames[::-1])[::-1]
 
 
 def moved(frames: np.ndarray) -> np.ndarray:
-    """Where the last frame differs from the one before, bool (360, 480)."""
+    """Return where the last frame differs from the one before, bool (360, 480)."""
     return _apart(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
 
 
 def before_hold(frames: np.ndarray) -> np.ndarray:
-    """The frames without those at the end in which nothing moves any more; at least one."""
+    """Return the frames without those at the end in which nothing moves any more; at least one."""
     shown = len(frames)
     while shown > 1 and moved(frames[:shown]).sum() < MOVED_PX:
         shown -= 1
@@ -188,7 +192,7 @@ def before_hold(frames: np.ndarray) -> np.ndarray:
 
 
 def still(frames: np.ndarray) -> bool:
-    """Whether nothing moves in the last two steps that are shown."""
+    """Return whether nothing moves in the last two steps that are shown."""
     return moved(frames).sum() < MOVED_PX and moved(frames[:-1]).sum() < MOVED_PX
 
 
@@ -199,7 +203,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:
-    """The frames with every flag painted over by what is beside it: a flag stands for a thing and is none.
+    """Return the frames with every flag painted over by what is beside it: a flag stands for a thing and is none.
 
     A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
     black flag the mast is told apart only below.
@@ -225,7 +229,7 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
 
 
 def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
-    """Box (x, y, width, height) of the patch of one colour around a pixel (x, y), if it may be a flag."""
+    """Return box (x, y, width, height) of the patch of one colour around a pixel (x, y), if it may be a flag."""
     height, width = still.shape[:2]
     if not (0 <= seed[0] < width and 0 <= seed[1] < height):
         return None
@@ -238,23 +242,23 @@ def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int
 
 
 def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
-    """Upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
+    """Return upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
     light = still.max(axis=2)
     beside = cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((1, 7), np.uint8))
     thin = ((light < 125) & (np.ptp(still, axis=2) < 30) & (cv2.subtract(beside, light) > 30)).astype(np.uint8)
     tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
     count, names = cv2.connectedComponents(tall, connectivity=8)
-    found = []
+    masts = []
     for name in range(1, count):
         y, x = np.nonzero(names == name)
         end = x[y < y.min() + 6]
         if np.ptp(x) < 3 * np.ptp(y) and np.ptp(end) < 12:
-            found.append((int(end.min()), int(y.min()), int(np.ptp(end)) + 1))
-    return found
+            masts.append((int(end.min()), int(y.min()), int(np.ptp(end)) + 1))
+    return masts
 
 
 def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:
-    """Whether the tracked thing is seen in each of the last frames and stays where it is."""
+    """Return whether the tracked thing is seen in each of the last frames and stays where it is."""
     tail = path[-last:]
     seen = [blob for blob in tail if blob is not None]
     if len(seen) < last:
@@ -264,5 +268,5 @@ def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.
 
 
 def is_panel(blob: Blob, longest_px: int = 130) -> bool:
-    """Whether a region is too long for a thing of a tabletop scene, or so thin that only a panel's edge is."""
+    """Return whether a region is too long for a thing of a tabletop scene, or so thin that only a panel's edge is."""
     return max(blob.box[2:]) > longest_px or min(blob.box[2:]) < 5

@@ -41,7 +41,7 @@ def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
 
 
 def choices_in(text: str) -> tuple[str, ...]:
-    """The choices that `kit.listed` reads out: 'red, blue or green' -> red, blue, green."""
+    """Return the choices that `kit.listed` reads out: 'red, blue or green' -> red, blue, green."""
     return tuple(re.split(r", | or ", text))
 
 
@@ -100,7 +100,7 @@ BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 
 def beyond_video(question: str) -> str | None:
-    """The property that no video shows and that the question asks for; None if it asks for none of them."""
+    """Return the property that no video shows and that the question asks for; None if it asks for none of them."""
     text = question.lower()
     return next((name for name, (words, _) in BEYOND_VIDEO.items() if re.search(words, text)), None)
 
@@ -169,25 +169,25 @@ _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
 
 def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
-    """All that the question presumes and the scene's inventory refutes. near: and colours that it does not have, but
-    has others like them: a viewer may take these for a second false premise, though they refute nothing."""
-    text, found = question.lower(), []
+    """Return all that the question presumes and the scene's inventory refutes. near: and colours that it does not have,
+    but has others like them: a viewer may take these for a second false premise, though they refute nothing."""
+    text, premises = question.lower(), []
     for thing in (*ABSENT_OBJECTS, "arrow", "stripe"):
         if re.search(rf"\b{thing}(s|es)?\b", text) and thing not in inventory.objects:
-            found.append(f"there is no {thing}")
+            premises.append(f"there is no {thing}")
     quality = re.search(NO_QUALITY_OF_A_COLOUR, text)
     if quality:
-        found.append(f"a colour has no {quality.group(1)}")
+        premises.append(f"a colour has no {quality.group(1)}")
     for colour in sorted(_COLOUR_WORDS):
         if re.search(rf"\b{colour}\b", text) and colour not in inventory.colours:
             if not near and not is_far(colour, inventory.colours):
                 continue
-            found.append(f"nothing is {colour}")
-    return found
+            premises.append(f"nothing is {colour}")
+    return premises
 
 
 def false_premise(question: str, inventory: Inventory) -> str | None:
-    """What the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
+    """Return what the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
     return next(iter(false_premises(question, inventory)), None)
 
 
@@ -199,20 +199,22 @@ def none_as_answer(question: str) -> str | None:
 
 
 def is_far(colour: str, present: Sequence[str]) -> bool:
-    """Whether a colour is none of some others and is not easily taken for one of them: at least `FAR_COLOUR` away."""
+    """Return whether a colour is none of some others and is not easily taken for one of them: at least `FAR_COLOUR`
+    away."""
     return colour not in present and all(colour_distance(colour, other) >= FAR_COLOUR for other in present)
 
 
 @cache
 def colour_distance(one: str, other: str) -> float:
-    """Least Euclidean distance in CIELAB (D65) of a named colour from another one, in shade and in bright light too."""
+    """Return least Euclidean distance in CIELAB (D65) of a named colour from another one, in shade and in bright light
+    too."""
     known = {**COLOURS, **_ELSEWHERE}
     seen = (tuple(min(1.0, light * part) for part in known[other]) for light in LIGHTS)
     return min(float(np.linalg.norm(_lab(known[one]) - _lab(as_lit))) for as_lit in seen)
 
 
 def _lab(srgb: Sequence[float]) -> np.ndarray:
-    """CIELAB of an sRGB colour in [0, 1]."""
+    """Return CIELAB of an sRGB colour in [0, 1]."""
     value = np.array(srgb)
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -222,14 +224,14 @@ def _lab(srgb: Sequence[float]) -> np.ndarray:
 
 
 def refutation(taxonomy: Taxonomy, question: str, inventory: Inventory) -> str | None:
-    """Why the question cannot be answered from the control; None if nothing says so."""
+    """Return why the question cannot be answered from the control; None if nothing says so."""
     return beyond_video(question) if taxonomy == "occlusion" else false_premise(question, inventory)
 
 
 def draw_ill_posed(
     taxonomy: Taxonomy, inventory: Inventory, rng: np.random.Generator, free: Callable[[str], bool] = lambda _: True
 ) -> str:
-    """An ill-posed question about a scene that is still free to use. Raises ValueError when all are taken."""
+    """Return an ill-posed question about a scene that is still free to use. Raises ValueError when all are taken."""
     questions = list(_beyond_video(inventory) if taxonomy == "occlusion" else _false_premises(inventory, rng))
     for i in rng.permutation(len(questions)):
         question = questions[i]

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 def flexes(model: mujoco.MjModel) -> dict[str, int]:
-    """The number of each soft body, by its name, in the order of the model."""
+    """Return the number of each soft body, by its name, in the order of the model."""
     import mujoco
 
     return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i): i for i in range(model.nflex)}
 
 
 def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
-    """Numbers of the bodies that carry a soft body: one a vertex, or the nodes of the cage around it."""
+    """Return numbers of the bodies that carry a soft body: one a vertex, or the nodes of the cage around it."""
     if model.flex_interp[flex]:
         first, count, bodies = model.flex_nodeadr[flex], model.flex_nodenum[flex], model.flex_nodebodyid
     else:
@@ -31,15 +31,15 @@ def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
 
 
 def is_carrier(model: mujoco.MjModel) -> np.ndarray:
-    """Whether each body is no thing of its own but carries a soft body, (nbody,) bool."""
-    found = np.zeros(model.nbody, bool)
+    """Return whether each body is no thing of its own but carries a soft body, (nbody,) bool."""
+    mask = np.zeros(model.nbody, bool)
     for flex in range(model.nflex):
-        found[carriers(model, flex)] = True
-    return found
+        mask[carriers(model, flex)] = True
+    return mask
 
 
 def vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarray:
-    """Where the vertices of a soft body are (m), (V, 3), once the bodies' poses are computed."""
+    """Return where the vertices of a soft body are (m), (V, 3), once the bodies' poses are computed."""
     import mujoco
 
     mujoco.mj_flex(model, data)
@@ -48,6 +48,7 @@ def vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarra
 
 
 def elements(model: mujoco.MjModel, flex: int) -> np.ndarray:
-    """The vertices of each element of a soft body (two of a rope, three of a cloth, four of a solid), (E, 2 to 4)."""
+    """Return the vertices of each element of a soft body (two of a rope, three of a cloth, four of a solid), (E, 2 to
+    4)."""
     corners, first = int(model.flex_dim[flex]) + 1, int(model.flex_elemdataadr[flex])
     return model.flex_elem[first : first + corners * int(model.flex_elemnum[flex])].reshape(-1, corners)

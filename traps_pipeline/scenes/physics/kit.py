@@ -46,7 +46,7 @@ REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
 
 
 def rgba(colour: str) -> list[float]:
-    """RGBA in [0, 1] of a named colour."""
+    """Return RGBA in [0, 1] of a named colour."""
     return [*COLOURS[colour], 1.0]
 
 
@@ -84,7 +84,7 @@ class Box:
     high: Vec3
 
     def corners(self) -> np.ndarray:
-        """The eight corners, shape (8, 3)."""
+        """Return the eight corners, shape (8, 3)."""
         grid = np.array(np.meshgrid(*zip(self.low, self.high, strict=True), indexing="ij"))
         return grid.reshape(3, 8).T
 
@@ -162,11 +162,11 @@ class Motion:
     vertices: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def pos(self, body: str) -> np.ndarray:
-        """World position of a body's frame, or of the middle of a soft body's vertices, shape (F, 3)."""
+        """Return world position of a body's frame, or of the middle of a soft body's vertices, shape (F, 3)."""
         return self.vertices[body].mean(axis=1) if body in self.vertices else self.positions[body]
 
     def rot(self, body: str) -> np.ndarray:
-        """Rotation matrices of a body, shape (F, 3, 3)."""
+        """Return rotation matrices of a body, shape (F, 3, 3)."""
         return self.rotations[body]
 
     def places(self, body: str, beside_m: float) -> np.ndarray:
@@ -249,8 +249,8 @@ class Family:
     )  # raises ValueError where parameters from a file are not plausible
 
     def params_from(self, values: Mapping[str, Any]) -> Any:
-        """Parameters from a stored mapping (lists become tuples). Raises ValueError naming the first that is unknown,
-        missing, of another type or not plausible."""
+        """Return parameters from a stored mapping (lists become tuples). Raises ValueError naming the first that is
+        unknown, missing, of another type or not plausible."""
         known = {f.name: f for f in fields(self.params)}
         needed = {name for name, f in known.items() if f.default is MISSING}
         unknown, missing = sorted(set(values) - set(known)), sorted(needed - set(values))
@@ -266,7 +266,7 @@ class Family:
 
 
 def params_to_dict(params: Any) -> dict[str, Any]:
-    """Plain JSON-able mapping of a family's parameters, without a look that is not there."""
+    """Return plain JSON-able mapping of a family's parameters, without a look that is not there."""
     absent = {each.name for each in fields(params) if each.default is None and getattr(params, each.name) is None}
     return {name: value for name, value in asdict(params).items() if name not in absent}
 
@@ -279,7 +279,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def new_spec(physics: Physics) -> mujoco.MjSpec:
-    """An empty world: sky, warm-grey floor, one key light with shadow, robust contact settings."""
+    """Return an empty world: sky, warm-grey floor, one key light with shadow, robust contact settings."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -337,7 +337,7 @@ def add_box(
     euler_y: float = 0.0,
     **attributes: Any,
 ) -> mujoco.MjsGeom:
-    """A box geom on a body (`spec.worldbody` for a static one), optionally tilted about y (rad)."""
+    """Return a box geom on a body (`spec.worldbody` for a static one), optionally tilted about y (rad)."""
     import mujoco
 
     geom = parent.add_geom(
@@ -353,7 +353,7 @@ def add_box(
 def add_ball(
     spec: mujoco.MjSpec, name: str, centre: Sequence[float], radius: float, colour: str, *, density: float = 1000.0
 ) -> mujoco.MjsGeom:
-    """A free ball (body `name`, geom `name`) with rolling friction, so that it comes to rest."""
+    """Return a free ball (body `name`, geom `name`) with rolling friction, so that it comes to rest."""
     import mujoco
 
     body = spec.worldbody.add_body(name=name, pos=list(centre))
@@ -369,7 +369,7 @@ def add_ball(
 
 
 def uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """A plain float between two bounds, rounded to 0.0001 so that stored parameters stay readable."""
+    """Return a plain float between two bounds, rounded to 0.0001 so that stored parameters stay readable."""
     return round(float(rng.uniform(low, high)), 4)
 
 
@@ -386,7 +386,7 @@ _LOOK_ALIKE = (
 
 
 def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) -> tuple[str, ...]:
-    """`count` colours of the pool in random order, no two of which are easily taken for each other."""
+    """Return `count` colours of the pool in random order, no two of which are easily taken for each other."""
     for _ in range(1000):
         chosen = tuple(str(c) for c in rng.permutation(list(pool))[:count])
         if len(chosen) == count and not any(pair <= set(chosen) for pair in _LOOK_ALIKE):
@@ -395,5 +395,5 @@ def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) 
 
 
 def listed(choices: Sequence[str]) -> str:
-    """The choices as they are read out: 'red, blue or green'."""
+    """Return the choices as they are read out: 'red, blue or green'."""
     return ", ".join(choices[:-1]) + " or " + choices[-1]

@@ -45,7 +45,7 @@ def simulate(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarra
 
 
 def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
-    """Body poses of a trajectory, and where its soft bodies are; no dynamics."""
+    """Return body poses of a trajectory, and where its soft bodies are; no dynamics."""
     import mujoco
 
     data, soft = mujoco.MjData(model), flexes(model)
@@ -68,8 +68,8 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
 
 
 def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Corners of the bounding boxes of all moving geoms, and of the elements of soft bodies, over a trajectory, eight
-    by eight, shape (N, 3)."""
+    """Return corners of the bounding boxes of all moving geoms, and of the elements of soft bodies, over a trajectory,
+    eight by eight, shape (N, 3)."""
     import mujoco
 
     data = mujoco.MjData(model)

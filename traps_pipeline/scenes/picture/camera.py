@@ -32,25 +32,25 @@ class Camera:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> Camera:
-        """The camera of a stored spec."""
+        """Return the camera of a stored spec."""
         return Camera(**_tuples(record))
 
     def axes(self) -> np.ndarray:
-        """Rows: right, up, forward unit vectors in the world, shape (3, 3)."""
+        """Return rows: right, up, forward unit vectors in the world, shape (3, 3)."""
         return _axes(self.azimuth_deg, self.elevation_deg)
 
     def position(self) -> np.ndarray:
-        """World position of the eye, shape (3,)."""
+        """Return world position of the eye, shape (3,)."""
         return np.array(self.lookat) - self.distance * self.axes()[2]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixel coordinates (x right, y down) of world points at 480x360, shape (N, 2)."""
+        """Return pixel coordinates (x right, y down) of world points at 480x360, shape (N, 2)."""
         right, up, depth = self.axes() @ (np.atleast_2d(points) - self.position()).T
         focal = HEIGHT / 2 / np.tan(np.radians(self.fovy_deg) / 2)
         return np.stack([WIDTH / 2 + focal * right / depth, HEIGHT / 2 - focal * up / depth], axis=1)
 
     def metres_a_pixel(self, point: np.ndarray) -> float:
-        """How long a pixel of 480x360 is at the depth of a point (3,)."""
+        """Return how long a pixel of 480x360 is at the depth of a point (3,)."""
         depth = float(self.axes()[2] @ (point - self.position()))
         return depth * float(np.tan(np.radians(self.fovy_deg) / 2)) / (HEIGHT / 2)
 
@@ -65,11 +65,11 @@ class Panel:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> Panel:
-        """The panel of a stored spec."""
+        """Return the panel of a stored spec."""
         return Panel(**_tuples(record))
 
     def corners(self) -> np.ndarray:
-        """The eight corners in the world, shape (8, 3)."""
+        """Return the eight corners in the world, shape (8, 3)."""
         local = Box(tuple(-h for h in self.half), self.half).corners()  # type: ignore[arg-type]
         c, s = np.cos(np.radians(self.yaw_deg)), np.sin(np.radians(self.yaw_deg))
         return local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array(self.centre)
@@ -99,7 +99,7 @@ def _axes(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
 
 
 def fit_camera(view: View, points: np.ndarray) -> Camera:
-    """The nearest camera in the view's direction that has all points (N, 3) within FRAME_FILL of the frame.
+    """Return the nearest camera in the view's direction that has all points (N, 3) within FRAME_FILL of the frame.
 
     With the orientation given, each frame edge is a half-space for the eye: the two pairs of edges give the largest
     admissible forward position, and the eye is centred between the edges that have slack.
@@ -126,7 +126,9 @@ def fit_camera(view: View, points: np.ndarray) -> Camera:
 
 
 def fit_panel(camera: Camera, cover: Box) -> Panel:
-    """The smallest upright panel on the floor, just in front of `cover`, that hides all of it from the camera."""
+    """Return the smallest upright panel on the floor, just in front of `cover`, that hides all of it from the
+    camera.
+    """
     eye = camera.position()
     azimuth = np.radians(camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -147,7 +149,9 @@ def fit_panel(camera: Camera, cover: Box) -> Panel:
 
 
 def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Panel | None]:
-    """Camera and panel together: the panel is placed by the camera, and the camera must have the panel in frame."""
+    """Return camera and panel together: the panel is placed by the camera, and the camera must have the panel in
+    frame.
+    """
     camera, panel = fit_camera(view, points), None
     if cover is None:
         return camera, None
@@ -158,7 +162,7 @@ def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera,
 
 
 def in_frame(camera: Camera, points: np.ndarray) -> bool:
-    """Whether all points (N, 3) are inside the frame."""
+    """Return whether all points (N, 3) are inside the frame."""
     pixels = camera.project(points)
     return bool((pixels > 0).all() and (pixels < (WIDTH, HEIGHT)).all())
 

@@ -15,12 +15,12 @@ SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
 
 
 def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:
-    """Indices of the last frames that the 5 FPS sample shows of a clip."""
+    """Return indices of the last frames that the 5 FPS sample shows of a clip."""
     return list(range(0, n_frames, fps // SAMPLED_FPS))[-count:]
 
 
 def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[tuple[str, ...], float]]) -> list[float]:
-    """The least number of pixels that each group of geoms has in any of the given frames of the control."""
+    """Return the least number of pixels that each group of geoms has in any of the given frames of the control."""
     geoms = sorted({name for names, _ in groups for name in names})
     counts = renderer.visible_pixels(qpos, geoms)
     return [float(counts[:, [geoms.index(n) for n in names]].sum(axis=1).min()) for names, _ in groups]
@@ -35,17 +35,19 @@ class PastPanel:
     hidden: np.ndarray
 
     def hidden_from(self) -> int:
-        """First frame from which no decisive body has a pixel until the end; the number of frames if none is."""
+        """Return first frame from which no decisive body has a pixel until the end; the number of frames if none is."""
         seen = np.flatnonzero(self.decisive)
         return int(seen[-1]) + 1 if seen.size else 0
 
     def leaked(self, first: int) -> float:
-        """Pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the panel hides."""
+        """Return pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the panel
+        hides.
+        """
         return float(self.decisive[first:].sum() + self.hidden.sum())
 
 
 def past_panel(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastPanel:
-    """What is seen past the panel of the geoms of decisive bodies and of the hidden element, by segmentation."""
+    """Return what is seen past the panel of the geoms of decisive bodies and of the hidden element, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], panel=True)
     return PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
@@ -61,8 +63,8 @@ def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step
 
 
 def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> float:
-    """Share of the picture's pixels over which anything moves that the panel covers. swept: corners (8, 3) of every
-    moving geom's box in every frame."""
+    """Return share of the picture's pixels over which anything moves that the panel covers. swept: corners (8, 3) of
+    every moving geom's box in every frame."""
     import cv2
 
     moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
@@ -74,7 +76,7 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> f
 
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
-    """The void that a trajectory makes, without the geoms that are named."""
+    """Yield the void that a trajectory makes, without the geoms that are named."""
     yield from renderer.frames(qpos, panel=True, without=without)
 
 
@@ -91,8 +93,8 @@ def closing_frames(renderer: Renderer, qpos: np.ndarray, board: Coming, *, panel
 def ablation_pixels(
     renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
 ) -> int:
-    """How many void pixels change, over the given frames, when the geoms are taken away. 0 proves that nothing of
-    them, shadow included, reaches the eye. void: the frames with them, if they are drawn already."""
+    """Return how many void pixels change, over the given frames, when the geoms are taken away. 0 proves that nothing
+    of them, shadow included, reaches the eye. void: the frames with them, if they are drawn already."""
     with_them = void_frames(renderer, qpos) if void is None else void
     return differing_pixels(with_them, void_frames(renderer, qpos, without=geoms))[0]
 

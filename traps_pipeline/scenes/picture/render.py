@@ -46,8 +46,8 @@ def _make_current(width: int, height: int) -> None:
 
 
 def gl_version() -> str:
-    """What draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by another
-    version may differ in single pixels. Only while a Renderer is open."""
+    """Return what draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by
+    another version may differ in single pixels. Only while a Renderer is open."""
     from OpenGL.GL import GL_VERSION
 
     return _gl_text(GL_VERSION)
@@ -142,7 +142,7 @@ class Renderer:
         without: Sequence[str] = (),
         board: Offset | None = None,
     ) -> Iterator[np.ndarray]:
-        """RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation). board: how
+        """Yield RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation). board: how
         far from its place (m) a board is that comes before the scene; None if none does."""
         import cv2
 
@@ -155,8 +155,8 @@ class Renderer:
     def visible_pixels(
         self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, panel: bool = False
     ) -> np.ndarray:
-        """How many pixels (of the 480x360 frame, so quarters occur) each geom or soft body has in each frame, shape
-        (F, G)."""
+        """Return how many pixels (of the 480x360 frame, so quarters occur) each geom or soft body has in each frame,
+        shape (F, G)."""
         import mujoco
 
         kinds = (int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_FLEX))
@@ -184,9 +184,9 @@ class Renderer:
             self._model.geom_pos[self._boards] = self._board_places + np.array(offset or (0.0, 0.0, 0.0))
 
     def _draw(self, qpos: np.ndarray, *, panel: bool, without: Sequence[str]) -> np.ndarray:
-        """The picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn again
-        while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves is
-        taken away. (The model does not change while it is drawn, but for the board that comes.)"""
+        """Return the picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn
+        again while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves
+        is taken away. (The model does not change while it is drawn, but for the board that comes.)"""
         import mujoco
 
         self._data.qpos[:] = qpos
@@ -236,12 +236,12 @@ class Renderer:
         return name in self._soft
 
     def _number(self, name: str) -> int:
-        """Of a geom, or of a soft body."""
+        """Return of a geom, or of a soft body."""
         return self._soft[name] if self._is_soft(name) else self._model.geom(name).id
 
     def _places(self, panel: bool, without: Sequence[str]) -> tuple[bytes, ...]:
-        """Where everything is that is shown, to the last bit, and the lights. In a model with other things than geoms
-        the whole pose stands for them."""
+        """Return where everything is that is shown, to the last bit, and the lights. In a model with other things than
+        geoms the whole pose stands for them."""
         model, data = self._model, self._data
         gone = [self._number(name) for name in without if not self._is_soft(name)]
         groups = model.geom_group

@@ -22,8 +22,8 @@ TOUCHES_M = 0.01  # an edge is no further from its wall
 
 
 def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping[str, tuple[str, ...]]:
-    """Each solid geom that is not drawn and does not lie parallel to the picture, by name, with the names of what shows
-    it: things that do not move, are drawn, touch it, and stop nothing themselves.
+    """Return each solid geom that is not drawn and does not lie parallel to the picture, by name, with the names of
+    what shows it: things that do not move, are drawn, touch it, and stop nothing themselves.
 
     qpos: a pose, (nq,); what is returned is at rest in all poses."""
     import mujoco
@@ -35,7 +35,7 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
     still = model.body_weldid[model.geom_bodyid] == 0
     drawn = model.geom_rgba[:, 3] > 0
     edges = np.flatnonzero(still & drawn & ~solid)
-    found: dict[str, tuple[str, ...]] = {}
+    names: dict[str, tuple[str, ...]] = {}
     for wall in np.flatnonzero(solid & ~drawn):
         if _faces_the_eye(model, data, camera, int(wall)):
             continue
@@ -44,12 +44,12 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
             for edge in edges
             if mujoco.mj_geomDistance(model, data, int(wall), int(edge), 2 * TOUCHES_M, np.zeros(6)) < TOUCHES_M
         ]
-        found[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in near)
-    return found
+        names[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in near)
+    return names
 
 
 def _faces_the_eye(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, geom: int) -> bool:
-    """Whether a geom is a pane, parallel to the picture, that is nearer to the eye than the scene's middle."""
+    """Return whether a geom is a pane, parallel to the picture, that is nearer to the eye than the scene's middle."""
     normal = data.geom_xmat[geom].reshape(3, 3)[:, int(np.argmin(model.geom_size[geom]))]
     forward = camera.axes()[2]
     is_parallel = abs(normal @ forward) > np.cos(np.radians(FACES_THE_EYE_DEG))

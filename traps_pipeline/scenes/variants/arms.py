@@ -54,7 +54,7 @@ class Scenario:
 
     @staticmethod
     def of_record(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray) -> Scenario:
-        """The scenario of a record and its trajectories, each (F, nq)."""
+        """Return the scenario of a record and its trajectories, each (F, nq)."""
         return Scenario(spec, World.of_record(spec, qpos), World.of_record(spec, twin, twin=True))
 
     @property
@@ -127,7 +127,7 @@ class Arm:
 
 
 def must_answer(spec: SceneSpec) -> list[Question]:
-    """The record's question of the arm's own clip, to be answered."""
+    """Return the record's question of the arm's own clip, to be answered."""
     return [Question("control", spec.question, spec.ground_truth)]
 
 
@@ -135,7 +135,7 @@ def must_answer(spec: SceneSpec) -> list[Question]:
 
 
 def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Panel]:
-    """Places for the void's own panel where it may hide nothing: behind everything, then beside it."""
+    """Yield places for the void's own panel where it may hide nothing: behind everything, then beside it."""
     panel, control = scenario.control.panel, scenario.control
     assert panel is not None, "an occlusion scenario has a panel"
     azimuth = np.radians(control.camera.azimuth_deg)
@@ -197,7 +197,7 @@ def _removed(scenario: Scenario) -> Take:
 
 
 def _late_panel(scenario: Scenario) -> Take:
-    """The panel comes in the last frame before the outcome is settled."""
+    """Return the panel comes in the last frame before the outcome is settled."""
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
@@ -214,7 +214,7 @@ def _late_panel(scenario: Scenario) -> Take:
 
 
 def _length_matched(scenario: Scenario) -> Take:
-    """The control's last open frames, as many as the void has; the observer answers from them."""
+    """Return the control's last open frames, as many as the void has; the observer answers from them."""
     spec, family, end = scenario.spec, scenario.control.family, scenario.control.open_frames
     frames = scenario.control_frames[end - spec.void["cut_frame"] : end]
     assert family.observe is not None, f"{family.name}: has no observer"
@@ -225,7 +225,8 @@ def _length_matched(scenario: Scenario) -> Take:
 
 
 def _predictable_cut(scenario: Scenario) -> Take:
-    """A cut shortly before the outcome is settled at which nearly all futures of the last frame shown agree with it."""
+    """Return a cut shortly before the outcome is settled at which nearly all futures of the last frame shown agree with
+    it."""
     control, commit = scenario.control, scenario.control.outcome.commit_frame
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
@@ -238,8 +239,8 @@ def _predictable_cut(scenario: Scenario) -> Take:
 
 
 def _agreeing(scenario: Scenario, frame: int) -> int | None:
-    """How many of FUTURES futures of the state in a frame, perturbed by the family's scale, end in the answer; None as
-    soon as they are too few."""
+    """Return how many of FUTURES futures of the state in a frame, perturbed by the family's scale, end in the answer;
+    None as soon as they are too few."""
     import mujoco
 
     control, spec = scenario.control, scenario.spec
@@ -385,7 +386,7 @@ ARMS: Mapping[str, Arm] = {
 
 
 def table() -> str:
-    """The arms as the Markdown table of `docs/arms.md`."""
+    """Return the arms as the Markdown table of `docs/arms.md`."""
     lines = ["| arm | of | asks | takes away | certificate |", "| --- | --- | --- | --- | --- |"]
     for arm in ARMS.values():
         of = [taxonomy for taxonomy in ("occlusion", "chaotic") if arm.name in arms_of(taxonomy)]

@@ -39,7 +39,7 @@ PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colo
 
 
 def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
-    """The scenario's question with so many choices, and these.
+    """Return the scenario's question with so many choices, and these.
 
     The answer and that of the twin, the other world behind the same void, are always among them, so that the void stays
     open; then come the question's own choices, and then colours that it does not name. Raises Rejected where the
@@ -59,7 +59,7 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
 
 
 def _mixed(spec: SceneSpec, labels: Sequence[str]) -> list[str]:
-    """The labels in an order that the scenario and nothing else decides."""
+    """Return the labels in an order that the scenario and nothing else decides."""
     return sorted(labels, key=lambda label: digest([spec.scenario_id, label]))
 
 
@@ -74,7 +74,7 @@ def _labels(count: int) -> Callable[[SceneSpec], list[Question]]:
 
 
 def _both(question: str, answer: str, labels: tuple[str, ...] | None = None) -> list[Question]:
-    """A question of both clips of the pair."""
+    """Return a question of both clips of the pair."""
     return [
         Question("control", question, answer, "control", labels),
         Question("void", question, None, "void", labels),
@@ -94,7 +94,7 @@ def _nothing(scenario: Scenario) -> Take:
 
 
 def _offered(scenario: Scenario) -> Take:
-    """Two worlds behind one void have different answers, and both are offered."""
+    """Return two worlds behind one void have different answers, and both are offered."""
     return Take([], {"offered": [scenario.spec.ground_truth, scenario.spec.twin.ground_truth]})
 
 
@@ -112,7 +112,7 @@ class Look:
 
 
 def _renderer(world: World, look: Look) -> Renderer:
-    """A renderer of a world whose panel has another look, from the pair's camera."""
+    """Return a renderer of a world whose panel has another look, from the pair's camera."""
     assert world.panel is not None, "an occlusion scenario has a panel"
     across, thickness, up = world.panel.half
     panel = replace(world.panel, half=(round(across * look.wide, 6), thickness, up))
@@ -144,7 +144,9 @@ def _void_with(scenario: Scenario, look: Look) -> Take:
 
 
 def _contrast(void: np.ndarray, control: np.ndarray) -> float:
-    """How far, in CIELAB, a panel is from what it covers: the mean over the pixels of a frame that it changes."""
+    """Return how far, in CIELAB, a panel is from what it covers: the mean over the pixels of a frame that it
+    changes.
+    """
     import cv2
 
     lab = [cv2.cvtColor((frame / 255).astype(np.float32), cv2.COLOR_RGB2LAB) for frame in (void, control)]
@@ -162,8 +164,8 @@ def _large(scenario: Scenario) -> Take:
 
 def _sheer(alpha: float) -> Callable[[Scenario], Take]:
     def film(scenario: Scenario) -> Take:
-        """A panel that lets light through, where it lets the outcome through: what tells the two worlds apart is seen
-        in the last sampled frames. Raises Rejected where it is not."""
+        """Return a panel that lets light through, where it lets the outcome through: what tells the two worlds apart is
+        seen in the last sampled frames. Raises Rejected where it is not."""
         look, last = Look(alpha=alpha), checks.last_sampled(len(scenario.control.qpos), scenario.fps)
         with _renderer(scenario.control, look) as renderer:
             frames = list(checks.void_frames(renderer, scenario.control.qpos))
@@ -186,8 +188,8 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
 
 
 def _later(scenario: Scenario) -> Take:
-    """The frames after those that models are shown at the end show the outcome too, but for those that a panel closes;
-    a void hides it in every frame."""
+    """Return the frames after those that models are shown at the end show the outcome too, but for those that a panel
+    closes; a void hides it in every frame."""
     control = scenario.control
     at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
     shown = [frame + 1 for frame in at_end]
@@ -257,7 +259,7 @@ VARIATIONS: Mapping[str, Arm] = {
 
 
 def table() -> str:
-    """The variations as the Markdown table of `docs/hypotheses.md`."""
+    """Return the variations as the Markdown table of `docs/hypotheses.md`."""
     groups = itertools.groupby(VARIATIONS.values(), key=lambda one: one.promises)
     rows = [("; ".join(f"`{one.name}`: {one.takes_away}" for one in same), promises) for promises, same in groups]
     return "\n".join(["| variation: change | certificate |", "| --- | --- |", *(f"| {a} | {b} |" for a, b in rows)])

@@ -106,7 +106,7 @@ class ClipCache:
         return f"{self.folder}: {len(sizes):,} clips, {sum(sizes) / 1e9:.2f} of {self.most_bytes / 1e9:g} GB"
 
     def _entry(self, clip: Path, scene_hash: str) -> Path | None:
-        """The place of a clip; None where nothing can be drawn, so that nobody knows what would draw it."""
+        """Return the place of a clip; None where nothing can be drawn, so that nobody knows what would draw it."""
         try:
             key = digest([scene_hash, clip.name, _renderer()])
         except RenderingUnavailable:

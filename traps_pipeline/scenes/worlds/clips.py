@@ -72,12 +72,12 @@ class Job:
 
 
 def note_of(clip: Path) -> Path:
-    """The small JSON beside a clip that says what it is; written after it, so that it vouches for it."""
+    """Return the small JSON beside a clip that says what it is; written after it, so that it vouches for it."""
     return clip.with_suffix(".json")
 
 
 def read_clip(path: Path) -> Clip | None:
-    """The clip if it is rendered; None if not. Raises DamagedClip when the file is not what its note says."""
+    """Return the clip if it is rendered; None if not. Raises DamagedClip when the file is not what its note says."""
     clip = read_note(path) if path.is_file() else None
     if clip is not None:
         check_clip(path, clip.file_sha256, clip.size_bytes)
@@ -85,7 +85,7 @@ def read_clip(path: Path) -> Clip | None:
 
 
 def read_note(path: Path) -> Clip | None:
-    """What the note of a clip says, wherever the clip is; None where there is none. Raises DamagedClip."""
+    """Return what the note of a clip says, wherever the clip is; None where there is none. Raises DamagedClip."""
     if not note_of(path).is_file():
         return None
     try:
@@ -100,7 +100,7 @@ def read_note(path: Path) -> Clip | None:
 
 
 def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
-    """Raises DamagedClip, naming the file and the remedy, unless it has that size and digest."""
+    """Raise DamagedClip, naming the file and the remedy, unless it has that size and digest."""
     size = path.stat().st_size if path.is_file() else 0
     if size != size_bytes or file_digest(path) != sha256:
         raise DamagedClip(
@@ -129,7 +129,7 @@ def render_pair(job: Job) -> int:
 
 
 def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
-    """What is missing of control and void, and of a twin that is the same scene from another start."""
+    """Return what is missing of control and void, and of a twin that is the same scene from another start."""
     spec = job.spec
     panel, closing = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None, closing_of(spec)
     behind = panel if closing is None else closing.panel
@@ -168,8 +168,9 @@ def _leaked_pixels(
     void: Sequence[np.ndarray],
     still: Sequence[int],
 ) -> float:
-    """What the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel hides
-    decisive bodies from hiding on, and the hidden element, without a trace. still: frames in which no board comes."""
+    """Return what the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel
+    hides decisive bodies from hiding on, and the hidden element, without a trace. still: frames in which no board
+    comes."""
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
     seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))

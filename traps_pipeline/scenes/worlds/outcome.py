@@ -47,7 +47,8 @@ class Outcome:
 
 
 def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
-    """The outcome of a trajectory as the family reads it; `certificates.settled_outcome` also holds it to account."""
+    """Return the outcome of a trajectory as the family reads it; `certificates.settled_outcome` also holds it to
+    account."""
     reading = family.outcome(motion, params)
     commit = last_run(reading.labels)
     label = reading.labels[-1]
@@ -56,15 +57,16 @@ def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
 
 
 def last_run(labels: Sequence[str | None]) -> int:
-    """The first frame from which the last label holds to the end."""
+    """Return the first frame from which the last label holds to the end."""
     return next((i + 1 for i in reversed(range(len(labels))) if labels[i] != labels[-1]), 0)
 
 
 def compile_scene(
     family: Family, params: Any, physics: Physics, panel: Panel | None = None
 ) -> tuple[mujoco.MjModel, Scene]:
-    """The compiled model of a scene, with the cover panel if one is given, and another one like it, just in front, that
-    comes before the scene where a control closes; each has a geom group of its own and collides with nothing."""
+    """Return the compiled model of a scene, with the cover panel if one is given, and another one like it, just in
+    front, that comes before the scene where a control closes; each has a geom group of its own and collides with
+    nothing."""
     scene = family.build(params, physics)
     if panel is not None:
         panels = []
@@ -81,7 +83,7 @@ def compile_scene(
 
 
 def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
-    """The trajectory of a compiled scene, (F, nq). Raises Rejected if the solver diverges."""
+    """Return the trajectory of a compiled scene, (F, nq). Raises Rejected if the solver diverges."""
     try:
         return simulate(model, scene, physics)
     except FloatingPointError as error:
@@ -89,13 +91,13 @@ def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarr
 
 
 def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of the geoms of bodies that move, and of soft bodies."""
+    """Return names of the geoms of bodies that move, and of soft bodies."""
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
     return (*(model.geom(int(i)).name for i in moving if model.geom(int(i)).name), *flexes(model))
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
-    """Names of the geoms of some bodies, and of those that are soft."""
+    """Return names of the geoms of some bodies, and of those that are soft."""
     soft = flexes(model)
     ids = {model.body(name).id for name in bodies if name not in soft}
     geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)

@@ -40,7 +40,7 @@ def settles_share(commit_frame: int, n_frames: int) -> float:
 
 
 def out_of_pace(share: float) -> str | None:
-    """What is wrong with an outcome that settles after a share of a clip."""
+    """Return what is wrong with an outcome that settles after a share of a clip."""
     if share < EARLIEST_SHARE:
         return f"the outcome settles after {share:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
     if share > LATEST_SHARE:
@@ -49,8 +49,8 @@ def out_of_pace(share: float) -> str | None:
 
 
 def exchangeable(family: Family) -> bool:
-    """Whether both worlds of a family's pairs count. Of soft bodies the control alone does: they settle in one world at
-    twice the time of the other, so that no length suits both."""
+    """Return whether both worlds of a family's pairs count. Of soft bodies the control alone does: they settle in one
+    world at twice the time of the other, so that no length suits both."""
     return family.category not in EXTENSION_CATEGORIES
 
 
@@ -59,8 +59,8 @@ def _counted(worlds: Sequence[World]) -> Sequence[World]:
 
 
 def lengths(worlds: Sequence[World], seed: int) -> list[int]:
-    """Numbers of frames to try for a clip of simulated worlds, best first: all that there are, or, where the outcome of
-    one is early, an even number that follows from the seed, and then the most."""
+    """Return numbers of frames to try for a clip of simulated worlds, best first: all that there are, or, where the
+    outcome of one is early, an even number that follows from the seed, and then the most."""
     worlds = _counted(worlds)
     n_frames, fps = len(worlds[0].qpos), worlds[0].physics.fps
     first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
@@ -74,9 +74,9 @@ def lengths(worlds: Sequence[World], seed: int) -> list[int]:
 
 
 def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
-    """Frames at which a control may close: when the outcome of every world has been in view, and at rest, for long
-    enough; where there is no time for that, and after all others, the last frame that is possible. None where no frame
-    is."""
+    """Yield frames at which a control may close: when the outcome of every world has been in view, and at rest, for
+    long enough; where there is no time for that, and after all others, the last frame that is possible. None where no
+    frame is."""
     worlds = _counted(worlds)
     fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
     last = last_of_all(len(worlds[0].qpos), fps)
@@ -90,18 +90,19 @@ def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
 
 
 def _at_rest_from(world: World) -> int:
-    """The frame from which every decisive body stays as it lies at the end: its middle, and three points around it."""
+    """Return the frame from which every decisive body stays as it lies at the end: its middle, and three points around
+    it."""
     paths = [world.motion.places(body, BESIDE_M) for body in world.scene.decisive]
     return still_from(*paths, within_m=STILL_M)
 
 
 def _even(frames: float) -> int:
-    """The largest even number of frames that is not more than so many."""
+    """Return the largest even number of frames that is not more than so many."""
     return 2 * int(frames / 2 + 1e-9)
 
 
 def cut_to(world: World, n_frames: int) -> World:
-    """The world's first frames, as a clip of its own."""
+    """Return the world's first frames, as a clip of its own."""
     if n_frames == len(world.qpos):
         return world
     simulated = None if world.simulated is None else world.simulated[:n_frames]
@@ -110,5 +111,5 @@ def cut_to(world: World, n_frames: int) -> World:
 
 
 def with_length(physics: Physics, n_frames: int) -> Physics:
-    """The settings of a clip of so many frames."""
+    """Return the settings of a clip of so many frames."""
     return replace(physics, duration_s=round(n_frames / physics.fps, 6))

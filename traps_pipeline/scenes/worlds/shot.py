@@ -18,13 +18,15 @@ if TYPE_CHECKING:
 
 
 def shown_points(model: mujoco.MjModel, scene: Scene, qpos: np.ndarray) -> np.ndarray:
-    """What a picture of a scene must hold: everything that moves over a trajectory, and the stage. Shape (N, 3)."""
+    """Return what a picture of a scene must hold: everything that moves over a trajectory, and the stage. Shape (N,
+    3).
+    """
     return np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.framed)])
 
 
 def shot_of(worlds: Sequence[World]) -> tuple[Camera, Panel | None]:
-    """The nearest camera that has all worlds in its frame, and the smallest panel that covers what any of them says; no
-    panel if some of them has nothing to cover."""
+    """Return the nearest camera that has all worlds in its frame, and the smallest panel that covers what any of them
+    says; no panel if some of them has nothing to cover."""
     points = np.concatenate([shown_points(world.model, world.scene, world.qpos) for world in worlds])
     covers = [world.scene.cover for world in worlds if world.scene.cover is not None]
     cover = box_around([box.corners() for box in covers]) if len(covers) == len(worlds) else None
@@ -32,7 +34,7 @@ def shot_of(worlds: Sequence[World]) -> tuple[Camera, Panel | None]:
 
 
 def box_around(points: Sequence[np.ndarray]) -> Box:
-    """The smallest box with all points, each (N, 3)."""
+    """Return the smallest box with all points, each (N, 3)."""
     every = np.concatenate(points)
     return Box(_corner(every.min(axis=0)), _corner(every.max(axis=0)))
 

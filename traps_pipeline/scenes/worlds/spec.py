@@ -192,7 +192,7 @@ _Part = TypeVar("_Part", bound=_Strict)
 
 
 def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
-    """A part of a record. Raises ValueError naming the field."""
+    """Return a part of a record. Raises ValueError naming the field."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -201,7 +201,7 @@ def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
 
 
 def trajectory_digest(qpos: np.ndarray) -> str:
-    """SHA-256 over shape and little-endian float32 values."""
+    """Return SHA-256 over shape and little-endian float32 values."""
     values = np.ascontiguousarray(qpos, dtype="<f4")
     return hashlib.sha256(repr(values.shape).encode() + values.tobytes()).hexdigest()
 
@@ -224,7 +224,7 @@ def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "q
         raise ValueError(f"{path}: no such trajectory; restore it from git or remove its record") from None
     except Exception as error:
         raise ValueError(f"{path}: not a readable trajectory ({error}); restore it from git") from error
-    found = trajectory_digest(qpos)
-    if found != sha256:
-        raise ValueError(f"{path}: digest {found[:12]} is not the record's {sha256[:12]}; restore the file from git")
+    digest = trajectory_digest(qpos)
+    if digest != sha256:
+        raise ValueError(f"{path}: digest {digest[:12]} is not the record's {sha256[:12]}; restore the file from git")
     return qpos

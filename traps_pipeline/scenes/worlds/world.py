@@ -52,7 +52,9 @@ class World:
 
     @staticmethod
     def of_record(spec: SceneSpec, qpos: np.ndarray, *, twin: bool = False, frame_step: int = 1) -> World:
-        """The control of a record, or its twin, with its trajectory. Raises ValueError for unknown parameters."""
+        """Return the control of a record, or its twin, with its trajectory. Raises ValueError for unknown
+        parameters.
+        """
         family = get_family(spec.family)
         params = spec.twin.params if twin and spec.twin.params is not None else spec.params
         return World(
@@ -137,7 +139,7 @@ class World:
         return range(0, len(self.qpos), self.frame_step)
 
     def renderer(self, *, supersample: int = SUPERSAMPLE) -> Renderer:
-        """A renderer of this world; close it before another one is opened."""
+        """Return a renderer of this world; close it before another one is opened."""
         return Renderer(self.model, self.camera, supersample=supersample)
 
     @property
@@ -166,7 +168,7 @@ class World:
     # certificates; each frame is drawn once.
 
     def behind_panel(self, which: Sequence[int]) -> list[np.ndarray]:
-        """Some frames of the world behind its panel, as they are drawn."""
+        """Return some frames of the world behind its panel, as they are drawn."""
         missing = [frame for frame in which if frame not in self._behind]
         if missing:
             with self.closed_renderer() as renderer:
@@ -178,8 +180,8 @@ class World:
         return {}
 
     def pixels_of(self, names: Sequence[str], which: Sequence[int] | None = None) -> np.ndarray:
-        """How many pixels some geoms have together behind the panel, by segmentation, in some frames, or in those that
-        are looked at, (F,)."""
+        """Return how many pixels some geoms have together behind the panel, by segmentation, in some frames, or in
+        those that are looked at, (F,)."""
         which = self.looked_at if which is None else which
         missing = [frame for frame in which if frame not in self._segmented]
         if missing:
@@ -194,7 +196,7 @@ class World:
         return {}
 
     def ablation_px(self, which: Sequence[int], geoms: tuple[str, ...]) -> int:
-        """How many pixels change behind the panel, over some frames, when geoms are taken away."""
+        """Return how many pixels change behind the panel, over some frames, when geoms are taken away."""
         missing = [frame for frame in which if (frame, geoms) not in self._ablated]
         if missing:
             whole = self.behind_panel(missing)
@@ -220,12 +222,13 @@ class World:
         return self.behind_panel(self.looked_at)
 
     def closed_renderer(self) -> Renderer:
-        """A renderer of this world with the panel that closes the control; close it before another one is opened."""
+        """Return a renderer of this world with the panel that closes the control; close it before another one is
+        opened."""
         return Renderer(self.closed_model, self.camera)
 
 
 def closing_of(spec: SceneSpec) -> Closing | None:
-    """How the control of a record closes."""
+    """Return how the control of a record closes."""
     if spec.control is None:
         return None
     panel = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]
