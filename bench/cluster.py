@@ -82,7 +82,7 @@ def rendered(study: Study, runs: int) -> tuple[float, list[Run]]:
 
 
 def without_cluster(count: int, cores: Sequence[int], plain: Mapping[str, str]) -> float:
-    """Return seconds that so many processes of `traps run` take to render the clips of one study, each bound to a
+    """Return the seconds that so many processes of `traps run` take to render the clips of one study, each bound to a
     core.
     """
     with tempfile.TemporaryDirectory(prefix="scale-") as name:

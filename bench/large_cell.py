@@ -53,7 +53,7 @@ def multiply(workspace: Path, items: int) -> None:
 
 
 def run(study_environment: dict[str, str], *command: str | Path) -> tuple[float, float]:
-    """Return seconds and peak GB of a command and its children."""
+    """Return the seconds and peak GB of a command and its children."""
     began = time.perf_counter()
     pid = os.posix_spawn(sys.executable, [sys.executable, *map(str, command)], study_environment)
     _, status, used = os.wait4(pid, 0)

@@ -46,7 +46,7 @@ def _model(spec: SceneSpec) -> mujoco.MjModel:
 
 
 def ours(spec: SceneSpec) -> int:
-    """Return frames of the control as the videos stage draws them; how many."""
+    """Return the frames of the control as the videos stage draws them; how many."""
     with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:
         return sum(1 for _ in renderer.frames(_qpos(spec)))
 

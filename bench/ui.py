@@ -138,7 +138,7 @@ def serving(command: list[str], environment: dict[str, str], folder: Path) -> It
 
 
 def seconds(page: Page, address: str, text: str) -> float:
-    """Return seconds from opening a page until it shows a text; the least of several views."""
+    """Return the seconds from opening a page until it shows a text; the least of several views."""
     found = []
     for _ in range(VIEWS):
         begun = time.monotonic()
@@ -149,7 +149,7 @@ def seconds(page: Page, address: str, text: str) -> float:
 
 
 def measure(kind: str, cells: int, browser: Any, *, in_database: bool) -> dict[str, float]:
-    """Return seconds of each page for one project."""
+    """Return the seconds of each page for one project."""
     from tests.objectstore import S3
     from tests.postgres import Postgres
 

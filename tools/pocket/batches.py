@@ -51,7 +51,7 @@ class Scenes:
             self.records += records
 
     def frames(self, scene: int, side: int, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return frames of a clip, uint8 (N, H, W, 3); pairs: of these pairs of frames alone."""
+        """Return the frames of a clip, uint8 (N, H, W, 3); pairs: of these pairs of frames alone."""
         shard, place = self._place[scene]
         frames = self._frames[shard][place, side]
         return frames if pairs is None else frames[[2 * pair + i for pair in pairs for i in (0, 1)]]
@@ -69,7 +69,7 @@ class Scenes:
         return every.reshape(-1, tokens, every.shape[1])[[*pairs]].reshape(-1, every.shape[1])
 
     def times(self, scene: int, side: int) -> list[float]:
-        """Return seconds into the clip of each frame."""
+        """Return the seconds into the clip of each frame."""
         record = self.records[scene]
         every = np.arange(record.length(side)) / get_family(record.family).physics.fps
         return every[pick(every, self._spec)].tolist()

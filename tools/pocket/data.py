@@ -92,7 +92,7 @@ class SceneRecord:
     decoy: bool = False
 
     def length(self, side: int) -> int:
-        """Return frames of the clip of a side (0 control, 1 void, 2 decoy)."""
+        """Return the frames of the clip of a side (0 control, 1 void, 2 decoy)."""
         if side == 1 and self.cut_frame is not None:
             return self.void_length or self.cut_frame
         return (self.control_until or self.n_frames) - self.control_from
@@ -151,7 +151,7 @@ class ShardJob:
 
 
 def params_digest(family: str, params: Any) -> str:
-    """Return digest of a scene's family and parameters, which is equal for equal scenes."""
+    """Return the digest of a scene's family and parameters, which is equal for equal scenes."""
     return digest({"family": family, "params": json.loads(json.dumps(params))})
 
 

@@ -75,7 +75,7 @@ def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
 
 @cache
 def code_digest(family: str) -> str:
-    """Return digest of the code that certifies a family: verdicts of other code are not believed."""
+    """Return the digest of the code that certifies a family: verdicts of other code are not believed."""
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])

@@ -200,7 +200,7 @@ _DECISIVE = (
 
 
 def item_hash(row: Record) -> str:
-    """Return digest of all of an item that decides its answer or its score."""
+    """Return the digest of all of an item that decides its answer or its score."""
     decisive = {name: row[name] for name in _DECISIVE}
     return digest(decisive | {"labels": list(row["labels"]), "aliases": json.loads(row["aliases"])})
 

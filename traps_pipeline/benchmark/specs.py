@@ -182,12 +182,12 @@ def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpe
 
 
 def released_version(workspace: Workspace, category: str) -> str:
-    """Return version of a category's released records in a study."""
+    """Return the version of a category's released records in a study."""
     return digest([spec.spec_hash for spec in released_in_study(workspace, category).values()])[:16]
 
 
 def corrections_version(workspace: Workspace, category: str) -> str:
-    """Return version of what the review decisions have made of a category's scenarios in a study."""
+    """Return the version of what the review decisions have made of a category's scenarios in a study."""
     scenarios = load_scenarios(workspace.study).values()
     return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
 

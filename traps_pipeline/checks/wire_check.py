@@ -72,7 +72,7 @@ def _studio() -> _Studio:
 
 
 def _frames() -> list[np.ndarray]:
-    """Return frames of a square that moves over a gradient."""
+    """Return the frames of a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
     frames = []

@@ -106,7 +106,7 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
 
 
 def protocol_digest(panel: str) -> str:
-    """Return digest of everything, besides the answers, that the labels of a study with this panel depend on."""
+    """Return the digest of everything, besides the answers, that the labels of a study with this panel depend on."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None

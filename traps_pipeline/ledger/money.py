@@ -113,6 +113,15 @@ class Money:
 
         return self._database.submit(change).result()
 
+    def releases(self) -> list[Mapping[str, object]]:
+        """Return the records of what was released, the oldest first."""
+        query = sa.select(RELEASES).order_by(RELEASES.c.id)
+        return self._database.submit(
+            lambda batch: [
+                dict(row) for row in batch.connection.execute(query.where(RELEASES.c.study == batch.study)).mappings()
+            ]
+        ).result()
+
     def _dead(self, batch: Batch) -> set[str]:
         return {session for session in _others(batch) if self._database.is_dead(session)}
 

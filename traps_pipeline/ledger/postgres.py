@@ -47,7 +47,7 @@ KEEPALIVE: dict[str, Any] = {
 
 
 def awake_s() -> float:
-    """Return seconds of a clock that goes on while this process is stopped or its machine sleeps."""
+    """Return the seconds of a clock that goes on while this process is stopped or its machine sleeps."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 

@@ -148,7 +148,7 @@ def _orthogonal(drawn: np.ndarray, unit: np.ndarray) -> np.ndarray:
 
 
 def vector_digest(vector: np.ndarray) -> str:
-    """Return digest of a direction's float32 numbers."""
+    """Return the digest of a direction's float32 numbers."""
     return hashlib.sha256(np.ascontiguousarray(vector, "<f4").tobytes()).hexdigest()[:32]
 
 

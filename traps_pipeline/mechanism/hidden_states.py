@@ -115,8 +115,7 @@ def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) 
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
-    """Return digest of everything that an item's states depend on: its prompt, the checkpoint, its precision, the
-    pooling."""
+    """Return the digest of all that an item's states depend on: prompt, checkpoint, precision, pooling."""
     return digest({"about": dict(item.about), "model": model.identity, "pooling": pooling})
 
 
@@ -169,8 +168,7 @@ def _look_for(folder: Path, known: dict[str, _Place]) -> None:
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return the items of a finished extraction (item_id, side, key, device) and their states at one layer, (n, d)
-    float32.
+    """Return the items of an extraction (item_id, side, key, device) and their states at one layer, (n, d) float32.
 
     layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (the latter after the final norm). Raises
     TrapsError for an extraction that is not finished, a layer that does not exist, or a damaged shard.
@@ -373,8 +371,7 @@ def _sound_rows(file: Path) -> int:
 
 
 def damage(file: Path) -> str:
-    """Return what is wrong with a file of an extraction (tensors or table), in words; empty where it is what was
-    written."""
+    """Return what is wrong with a file of an extraction (tensors or table), in words; empty if nothing is."""
     try:
         _sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
     except (OSError, ValueError, TrapsError) as error:

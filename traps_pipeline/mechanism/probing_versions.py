@@ -62,7 +62,7 @@ def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt,
+    """Return the digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt,
     pooling."""
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     if settings is not None and entry.id in settings.models:
@@ -77,7 +77,7 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return digest of the study's settings for the probes and directions of a model."""
+    """Return the digest of the study's settings for the probes and directions of a model."""
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -91,7 +91,7 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return digest of the inputs of sentences besides items and answers: those of states, the sentences, the
+    """Return the digest of the inputs of sentences besides items and answers: those of states, the sentences, the
     prompt.
     """
     settings = workspace.study.mechanism
@@ -111,7 +111,7 @@ def patching_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def steering_version(workspace: Workspace, run: str) -> str:
-    """Return digest of the inputs of steered answers besides items and directions: the study's settings, model and
+    """Return the digest of the inputs of steered answers besides items and directions: the study's settings, model and
     prompt."""
     model, _, regime = run.split("__")
     entry, settings = get_model(model), workspace.study.mechanism

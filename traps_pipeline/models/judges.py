@@ -187,12 +187,12 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 
 def panel_version(panel: str) -> str:
-    """Return version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
+    """Return the version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
     return version_of_seats(load_panel(panel)) if panel else "no panel is named"
 
 
 def version_of_seats(seats: Iterable[Judge]) -> str:
-    """Return version of what these judges decide."""
+    """Return the version of what these judges decide."""
     judges = list[list[Any]]()
     for seat in seats:
         more = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []

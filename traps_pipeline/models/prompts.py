@@ -45,7 +45,7 @@ def vqa_prompt(name: str) -> str:
 
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
-    """Return version of a regime's system prompt, and of its variations in those datasets that have one."""
+    """Return the version of a regime's system prompt, and of its variations in those datasets that have one."""
     varied = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
     return digest([system_prompt(regime), *varied] if varied else system_prompt(regime))[:16]
 

@@ -166,7 +166,7 @@ def _reset_s(named: Mapping[str, str], now: float) -> float | None:
 
 
 def _seconds(value: Any, now: float) -> float | None:
-    """Return seconds from a number, an amount with units ("1m30s") or a date; None for what is none of these."""
+    """Return the seconds from a number, an amount with units ("1m30s") or a date; None for what is none of these."""
     text = str(value).strip() if isinstance(value, str | int | float) else ""
     try:
         number = float(text)

@@ -355,7 +355,7 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 
 
 def answering_version(evaluation: Evaluation) -> str:
-    """Return version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
+    """Return the version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
     entry = get_model(evaluation.model)
     sent: list[Any] = [effective_params(entry, evaluation.regime)]
     sent += [profile_digest(entry.media)] if entry.media else []

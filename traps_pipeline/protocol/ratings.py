@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 YES, NO, INVALID = 1, 0, -1  # values of a vote; for a majority, INVALID means undecided
 PANEL = "panel"  # stands for all judges together in a column that names a judge
@@ -55,6 +58,8 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
     An answer that was not put to all of these judges is left out: another panel judged it.
     """
+    import pandas as pd
+
     seats = tuple(sorted(votes["judge"].unique()) if judges is None else judges)
     votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
     rows, first = _grouped(votes, [*answer, "task"])
@@ -73,6 +78,8 @@ def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.nda
     """Return the number of each vote's group by these columns, (votes,), and the first vote of each group,
     (groups,).
     """
+    import pandas as pd
+
     code = np.zeros(len(votes), np.int64)
     for name in by:
         own, known = pd.factorize(votes[name])
@@ -98,4 +105,6 @@ def majority(values: np.ndarray) -> np.ndarray:
 
 def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
     """Return the votes as true (YES), false (NO) and null (INVALID)."""
+    import pandas as pd
+
     return pd.arrays.BooleanArray(votes == YES, votes == INVALID)

@@ -25,7 +25,7 @@ CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES + EXTENSION_CATEGORIES, "chaotic
 
 @cache
 def family_names() -> tuple[str, ...]:
-    """Return names of all families, sorted; nothing is imported."""
+    """Return the names of all families, sorted; nothing is imported."""
     return tuple(sorted(module.name for module in pkgutil.iter_modules(package.__path__)))
 
 

@@ -40,7 +40,7 @@ def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
 
 
 def published_digest() -> str:
-    """Return digest of `assets/published`, from which the paper's tables and figures are made."""
+    """Return the digest of `assets/published`, from which the paper's tables and figures are made."""
     files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
     return digest(files)[:16]
 

@@ -218,7 +218,7 @@ def read_note(note: Path) -> Media:
 
 
 def profile_digest(spec: MediaSpec) -> str:
-    """Return digest of all that decides the bytes of a profile, the clip aside."""
+    """Return the digest of all that decides the bytes of a profile, the clip aside."""
     content: dict[str, Any] = {"revision": _REVISION, "spec": spec.content()}
     if spec.profile == "video":
         content["encoder"] = ENCODER
@@ -298,8 +298,7 @@ def _require(clip: Path, clip_digest: str) -> None:
 
 
 def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
-    """Return frames a second at which the picked frames play: fps, or those of a slower clip, which would else be sped
-    up."""
+    """Return frames a second at which the picked frames play: fps, or those of a slower clip."""
     rate = min(spec.fps or 1, sampled.clip_fps or np.inf)
     if rate != int(rate):
         raise TrapsError(
@@ -397,6 +396,5 @@ _URIS = UriCache(CACHE_BYTES)
 
 
 def data_uris(media: Media) -> tuple[str, ...]:
-    """Return what `payload` gives as data URIs, from a cache that this process's calls share. Raises what `payload`
-    raises."""
+    """Return what `payload` gives, or raises, as data URIs, from a cache that this process's calls share."""
     return _URIS.get(media)

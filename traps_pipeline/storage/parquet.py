@@ -365,7 +365,7 @@ def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
 
 
 def content_version(data: pa.Table) -> str:
-    """Return digest of a table's content, volatile columns left out: unchanged content makes nothing downstream
+    """Return the digest of a table's content, volatile columns left out: unchanged content makes nothing downstream
     stale.
     """
     lasting = data.drop_columns([c for c in VOLATILE if c in data.column_names])

@@ -246,7 +246,7 @@ class Workspace:
         return self.root / "checks" / stage / check / f"{key or stage}.json"
 
     def failed_checks(self, stage: str, key: str | None) -> list[str]:
-        """Return names of the checks of a partition that do not pass."""
+        """Return the names of the checks of a partition that do not pass."""
         files = self.store.below(self.root / "checks" / stage, f"*/{key or stage}.json")
         return sorted(path.parent.name for path in files)
 

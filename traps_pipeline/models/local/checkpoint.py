@@ -134,7 +134,7 @@ def _names_code(path: Path) -> bool:
 
 
 def folder_digest(folder: Path) -> str:
-    """Return digest of a checkpoint folder's content, wherever it lies; computed anew only when a file changed."""
+    """Return the digest of a checkpoint folder's content, wherever it lies; computed anew only when a file changed."""
     files = sorted(path for path in folder.iterdir() if path.suffix in _FILES)
     stamps = tuple((path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files)
     return _content_digest(folder, stamps)

@@ -91,13 +91,13 @@ def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarr
 
 
 def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return names of the geoms of bodies that move, and of soft bodies."""
+    """Return the names of the geoms of bodies that move, and of soft bodies."""
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
     return (*(model.geom(int(i)).name for i in moving if model.geom(int(i)).name), *flexes(model))
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
-    """Return names of the geoms of some bodies, and of those that are soft."""
+    """Return the names of the geoms of some bodies, and of those that are soft."""
     soft = flexes(model)
     ids = {model.body(name).id for name in bodies if name not in soft}
     geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)
