@@ -82,14 +82,15 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
     for row, column in grid.cells(keys):
         wanted[row, column] = True
     heads = np.array([name.partition("__")[0] for name in grid.columns])
-    return [grid.range(*corners) for corners in _parts(wanted, heads, 0, 0, most)]
+    by_model = most < len({*heads[wanted.any(axis=0)]})
+    return [grid.range(*corners) for corners in _parts(wanted, heads, 0, 0, most, by_model=by_model)]
 
 
 def _parts(
-    wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int
+    wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int, *, by_model: bool
 ) -> Iterator[tuple[int, int, int, int]]:
     """Yield rectangles (first and last row, first and last column) around the wanted cells of one whose first cell has
-    these numbers. heads: the model of each column of it."""
+    these numbers. heads: the model of each column of it; by_model: cut between models where there are enough."""
     rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
     down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     wanted, heads, top, left = wanted[down, across], heads[across], top + int(rows[0]), left + int(columns[0])
@@ -100,16 +101,16 @@ def _parts(
         return
     cuts = np.arange(1, width)
     changes = cuts[heads[1:] != heads[:-1]]
-    if count <= len(changes):
+    if by_model and count <= len(changes):
         cuts = changes
     if width > 1:
         at, share = _halves(wanted.sum(axis=0), cuts, {*changes.tolist()}, count)
-        yield from _parts(wanted[:, :at], heads[:at], top, left, share)
-        yield from _parts(wanted[:, at:], heads[at:], top, left + at, count - share)
+        yield from _parts(wanted[:, :at], heads[:at], top, left, share, by_model=by_model)
+        yield from _parts(wanted[:, at:], heads[at:], top, left + at, count - share, by_model=by_model)
     else:
         at, share = _halves(wanted.sum(axis=1), np.arange(1, height), set[int](), count)
-        yield from _parts(wanted[:at], heads, top, left, share)
-        yield from _parts(wanted[at:], heads, top + at, left, count - share)
+        yield from _parts(wanted[:at], heads, top, left, share, by_model=by_model)
+        yield from _parts(wanted[at:], heads, top + at, left, count - share, by_model=by_model)
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
