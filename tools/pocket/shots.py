@@ -72,7 +72,8 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     span, held = (0, len(control.qpos)), None
     if cut is not None and jitter is not None:
         span, held = _jittered(jitter, control, rng)
-    frames = {"first": span[0], "last": control.open_frames - 1} | ({} if cut is None else {"cut": cut - 1})
+    frames = {"first": span[0], "last": min(span[1], control.open_frames) - 1}
+    frames |= {} if cut is None else {"cut": cut - 1}
     pixels = camera.project(motion.pos(scene.decisive[0])[list(frames.values())]) / (WIDTH, HEIGHT)
     places = {name: (round(float(x), 4), round(float(y), 4)) for name, (x, y) in zip(frames, pixels, strict=True)}
     return Shot(control, wording, outcome, cut, ill_posed, places, span, held)
@@ -103,9 +104,10 @@ def _jittered(jitter: Jitter, control: World, rng: np.random.Generator) -> tuple
     fps, n = control.physics.fps, len(control.qpos)
     short, held = rng.random(2) < (jitter.control, jitter.void)
     length = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
-    # A short control ends where the panel would come, as in the arm length_matched. A void is held to the very end: of
-    # lengths in between there are no controls, so that they alone would tell a void.
-    return (control.open_frames - length, control.open_frames) if short else (0, n), (n if held else None)
+    # A short control ends before the board comes into the picture: on its way it may cover the outcome. A void is held
+    # to the very end: of lengths in between there are no controls, so that they alone would tell a void.
+    end = control.clear_frames
+    return (end - length, end) if short else (0, n), (n if held else None)
 
 
 def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.ndarray]]:
