@@ -98,8 +98,8 @@ def _require_known(scenario_id: str, seen: int, folder: Path) -> list[Correction
 
 @contextmanager
 def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
-    """What appends decisions, while no other process does. Raises TrapsError where a later file would overrule them,
-    and where the folder belongs to an installed wheel."""
+    """Return what appends decisions, while no other process does. Raises TrapsError where a later file would overrule
+    them, and where the folder belongs to an installed wheel."""
     require_own_corrections(folder).mkdir(parents=True, exist_ok=True)
     later = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
     if later:

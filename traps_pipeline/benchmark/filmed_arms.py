@@ -100,7 +100,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """About how long one core films what is missing of a category's arms, as far as released records tell."""
+    """Estimate how long one core films what is missing of a category's arms, as far as released records tell."""
     found = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()

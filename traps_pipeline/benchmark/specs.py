@@ -142,7 +142,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """About how long one core builds a category's table."""
+    """Estimate how long one core builds a category's table."""
     return SECONDS_A_RECORD * sum(one.category == category for one in load_scenarios(workspace.study).values())
 
 

@@ -59,7 +59,7 @@ def _render(job: Job) -> int:
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """About how long one core renders what is missing of a category, as far as released records tell."""
+    """Estimate how long one core renders what is missing of a category, as far as released records tell."""
     clips = [
         workspace.clip(id_, side, spec.scene_hash)
         for id_, spec in released_in_study(workspace, category).items()

@@ -48,7 +48,7 @@ class Bucket:
 
     @contextmanager
     def _used(self) -> Iterator[None]:
-        """Within the block the store is used. Raises FileNotFoundError where an object is not there, TrapsError where
+        """Use the store within the block. Raises FileNotFoundError where an object is not there, TrapsError where
         the store cannot be used."""
         from obstore.exceptions import BaseError, NotFoundError
 

@@ -81,7 +81,7 @@ class KeptConnections(CreateEnginePlugin):
     fifths of the time of a run that asks models in small cells."""
 
     def __init__(self, url: URL, kwargs: dict[str, Any]) -> None:
-        """Called by SQLAlchemy for an address that names this plugin."""
+        """Create the dialect; called by SQLAlchemy for an address that names this plugin."""
         super().__init__(url, kwargs)
         kwargs.pop("poolclass", None)
         alive = {"keepalives_idle": 5, "keepalives_interval": 5, "keepalives_count": 3, "tcp_user_timeout": 15_000}

@@ -171,7 +171,7 @@ class Ledger:
 
     @asynccontextmanager
     async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = never) -> AsyncIterator[Writer]:
-        """Be the one writer of an evaluation. While another one is, wait and say once who it is.
+        """Become the one writer of an evaluation. While another process is, wait and report once which.
 
         Raises LockGivenUp when `give_up` says so while waiting, and TrapsError.
         """

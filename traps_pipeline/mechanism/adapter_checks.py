@@ -216,7 +216,8 @@ def _batches(subject: Subject) -> str:
 
 @contextmanager
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
-    """Inside, a token that an answer has early ends answers, so that rows of a batch end at different tokens."""
+    """Let a token that an answer has early end answers within the block, so that rows of a batch end at different
+    tokens."""
     config = model.network.generation_config
     before, config.eos_token_id = config.eos_token_id, [token]
     try:

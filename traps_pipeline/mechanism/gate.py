@@ -165,8 +165,8 @@ class Outcomes:
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
     def figures(self, weight: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """acc, false_abs, abs_rec and pecs, each () or, with weights (resamples, n), (resamples,). NaN where nothing
-        was decided."""
+        """Return acc, false_abs, abs_rec and pecs, each () or, with weights (resamples, n), (resamples,). NaN where
+        nothing was decided."""
         weight = np.ones((1, len(self.void))) if weight is None else weight
         parts = {"acc": (~self.void, self.correct), "false_abs": (~self.void, self.abstained)}
         parts |= {"abs_rec": (self.void, self.abstained)}

@@ -157,7 +157,7 @@ def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[
 def _decisions(
     workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]
 ) -> dict[tuple[str, str], tuple[Decisions, int]]:
-    """By source and target, a gate's decisions and the layer of its states (-1 for other features)."""
+    """Return, by source and target, a gate's decisions and the layer of its states (-1 for other features)."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
     decisions: dict[tuple[str, str], tuple[Decisions, int]] = {}

@@ -181,7 +181,8 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """By dataset, the scenarios on whose void the model confabulated under Standard in run 1, or why there is none."""
+    """Return, by dataset, the scenarios on whose void the model confabulated under Standard in run 1, or why there is
+    none."""
     scenarios: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
     for dataset in DATASETS:

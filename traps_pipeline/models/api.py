@@ -105,8 +105,8 @@ def client_version() -> str:
 
 @cache
 def _internal_call() -> Any:
-    """litellm's own mark of a call that it need not log. Its log of every call, which nobody reads here, takes a sixth
-    of a call's CPU time and lags behind, holding what was sent: 5 KB a call without media, without a bound."""
+    """Return litellm's own mark of a call that it need not log. Its log of every call, which nobody reads here, takes a
+    sixth of a call's CPU time and lags behind, holding what was sent: 5 KB a call without media, without a bound."""
     return import_module("litellm._internal_context").is_internal_call
 
 

@@ -343,7 +343,7 @@ async def _exhaust(results: AsyncIterator[Any]) -> None:
 
 
 def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
-    """One exception for all models that failed; sentences stay sentences."""
+    """Return one exception for all models that failed; sentences stay sentences."""
     if problems and all(isinstance(problem, TrapsError) for problem in problems):
         kind = BudgetReached if any(isinstance(problem, BudgetReached) for problem in problems) else TrapsError
         raise kind("\n".join(sorted({str(problem) for problem in problems})))

@@ -95,7 +95,7 @@ def minutes_of(forecasts: Iterable[Forecast]) -> float:
 
 
 def _clip_tokens(entry: Entry) -> tuple[float, float]:
-    """Prompt tokens of a clip: expected, and at most."""
+    """Return the prompt tokens of a clip: expected, and at most."""
     if not isinstance(entry, ModelEntry) or entry.media is None:
         return 0.0, 0.0
     most = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)

@@ -65,7 +65,8 @@ def qwen3_vl_frame(size: Size, profile: Profile) -> float:
 
 
 def expected_clip_tokens(entry: ModelEntry) -> float:
-    """Prompt tokens of a whole clip. For a provider or model that is not known here, the entry's `tokens_per_frame`."""
+    """Return the prompt tokens of a whole clip. For a provider or model that is not known here, the entry's
+    `tokens_per_frame`."""
     media = entry.media
     if media is None:
         return 0.0

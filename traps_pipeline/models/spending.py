@@ -17,7 +17,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @contextmanager
 def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
-    """The study's budget, less what was spent. All processes of the study spend from it at the same time. Raises
+    """Return the study's budget, less what was spent. All processes of the study spend from it at the same time. Raises
     TrapsError."""
     _check_names(workspace)
     caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
@@ -45,7 +45,7 @@ def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Cal
 
 
 def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
-    """By participant, the budget of its account where `study.yaml` names a folder for it. Raises TrapsError."""
+    """Return, by participant, the budget of its account where `study.yaml` names a folder for it. Raises TrapsError."""
     study, shared = workspace.study, dict[str, AccountBudget]()
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
@@ -62,7 +62,7 @@ def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
 
 
 def _check_names(workspace: Workspace) -> None:
-    """A cap for nobody caps nothing. Raises TrapsError."""
+    """Raise TrapsError for a cap of a participant that the study does not have."""
     if unknown := workspace.study.account_budgets.keys() - load_accounts().keys():
         raise TrapsError(
             f"{workspace.root / 'study.yaml'}: account_budgets names {', '.join(sorted(unknown))}, no account of "

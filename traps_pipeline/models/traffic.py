@@ -48,13 +48,13 @@ class Gate:
             self._wake()
 
     def slow_down(self) -> None:
-        """The provider said 429."""
+        """Note that the provider said 429."""
         now = time.monotonic()
         if now - self._slowed_at >= 1.0:
             self.limit, self._slowed_at, self._answers = max(1, self.limit // 2), now, 0
 
     def answered(self) -> None:
-        """The provider answered."""
+        """Note that the provider answered."""
         self._answers += 1
         if self.limit < self.most and self._answers >= self.limit:
             self.limit, self._answers = self.limit + 1, 0
@@ -121,7 +121,7 @@ _stopped: list[dict[str, str]] = []  # of each `remembering_stops` in force: par
 
 @contextmanager
 def remembering_stops() -> Iterator[None]:
-    """Within the block a participant that was stopped stays so for all who ask it next, for the same reason."""
+    """Keep a stopped participant stopped, within the block, for all who ask it next, for the same reason."""
     _stopped.append({})
     try:
         yield

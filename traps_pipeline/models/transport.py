@@ -58,7 +58,7 @@ WATCHED: ContextVar[Exchange | None] = ContextVar("watched", default=None)
 
 @contextmanager
 def watching() -> Iterator[Exchange]:
-    """Within the block the wire writes into this exchange: the one that a caller watches already, or a new one."""
+    """Let the wire write into this exchange within the block: the one that a caller watches already, or a new one."""
     if (outer := WATCHED.get()) is not None:
         yield outer
         return

@@ -329,7 +329,7 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
-    """Elementwise: infinite where only the denominator is 0, NaN where both are."""
+    """Divide elementwise: infinite where only the denominator is 0, NaN where both are."""
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return top / bottom

@@ -201,7 +201,7 @@ def holm(p: np.ndarray) -> np.ndarray:
 
 
 def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, _Side, _Side]]:
-    """kind, dataset, left, right of every comparison, each once."""
+    """Return kind, dataset, left, right of every comparison, each once."""
     for dataset in (*DATASETS, "overall"):
         sides = [(model, regime) for model, regime, name in entries if name == dataset]
         for left, right in combinations(sides, 2):

@@ -107,8 +107,8 @@ def _deviation(values: pd.Series) -> float:
 
 
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there is no
-    PECS, and where the row is of several panels."""
+    """Return rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there
+    is no PECS, and where the row is of several panels."""
     known = contrasts["separable"].astype("boolean").fillna(False)
     separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & known]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()

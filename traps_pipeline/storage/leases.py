@@ -16,7 +16,7 @@ POLL_S = 0.2
 
 @contextmanager
 def alone(store: Store, name: str) -> Iterator[None]:
-    """Have a piece of work for the time of the block; a second process waits. Raises TrapsError where no lease can be
+    """Hold a piece of work for the time of the block; a second process waits. Raises TrapsError where no lease can be
     had."""
     while (lease := store.lease(name)) is None:
         time.sleep(POLL_S)

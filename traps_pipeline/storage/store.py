@@ -106,7 +106,7 @@ class Store(ABC):
 
     @abstractmethod
     def changed_ns(self, path: Path) -> int:
-        """When the file was written, in ns since 1970; 0 where there is none."""
+        """Return when the file was written, in ns since 1970; 0 where there is none."""
 
     @abstractmethod
     def look(self) -> None:

@@ -41,7 +41,7 @@ class _Batch:
     abandoned: Event = field(default_factory=Event)
 
     def forget(self, _: asyncio.Future[Outcome]) -> None:
-        """Called as each answer is known or no longer wanted."""
+        """Note an answer as it is known or no longer wanted."""
         if all(answer.cancelled() for answer in self.answers):
             self.abandoned.set()
 
@@ -86,7 +86,7 @@ class LocalBackend:
                         answer.set_result(outcome)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """In the worker thread: load, look, generate."""
+        """Load, look and generate, in the worker thread."""
         from traps_pipeline.models.local.adapter import load_local_model
         from traps_pipeline.models.local.sampling import Sampling
 

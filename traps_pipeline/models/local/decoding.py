@@ -28,7 +28,7 @@ class Steers(Protocol):
     """What may change hidden states during a pass: `mechanism.hook.Steering`."""
 
     def rows(self, chosen: Sequence[int]) -> Steers:
-        """That of some of the prompts."""
+        """Return the decoding of some of the prompts."""
         ...
 
     def applied(self, model: Any) -> AbstractContextManager[None]:

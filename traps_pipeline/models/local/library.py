@@ -57,7 +57,7 @@ _KEPT: list[Any] = []
 
 
 def _torchvision_library() -> Path | None:
-    """torchvision's compiled library, found without importing the package; None if there is none."""
+    """Return the path of torchvision's compiled library without importing the package; None if there is none."""
     spec = find_spec("torchvision")
     folders = list(spec.submodule_search_locations or ()) if spec else []
     return next((path for folder in folders for path in Path(folder).glob("_C*.so")), None)

@@ -66,8 +66,9 @@ class LocalModel:
         network.generation_config = self._plain_generation()
 
     def _plain_generation(self) -> Any:
-        """Only what ends an answer and what is no text: a checkpoint's own top_k or repetition penalty would else be
-        applied unasked. Placeholders of pictures are no text: an answer that held one could not be read again."""
+        """Return only what ends an answer and what is no text: a checkpoint's own top_k or repetition penalty would
+        else be applied unasked. Placeholders of pictures are no text: an answer that held one could not be read
+        again."""
         own, tokenizer = self.network.generation_config, self.processor.tokenizer
         eos = own.eos_token_id if own.eos_token_id is not None else tokenizer.eos_token_id
         if eos is None:
@@ -164,7 +165,7 @@ class LocalModel:
         return text
 
     def remembering_clips(self) -> AbstractContextManager[None]:
-        """Inside, the vision tower sees each clip once (`clips`)."""
+        """Let the vision tower see each clip once within the block (`clips`)."""
         return self.clips.remembering(self.network)
 
     # --- hidden states ------------------------------------------------------------------------------------------------

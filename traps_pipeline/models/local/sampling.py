@@ -22,7 +22,7 @@ class Sampling:
     seeds: Sequence[int]
 
     def rows(self, chosen: Sequence[int]) -> Sampling:
-        """That of some of the prompts."""
+        """Return the sampling of some of the prompts."""
         return Sampling(self.temperature, self.top_p, [self.seeds[i] for i in chosen])
 
 
@@ -37,7 +37,7 @@ class SeededNucleus:
         self._streams = [np.random.default_rng(seed) for seed in sampling.seeds]
 
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
-        """scores: (rows, vocabulary) logits; the same shape comes back."""
+        """Scale and cut logits for sampling. scores: (rows, vocabulary) logits; the same shape comes back."""
         import torch
 
         probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)

@@ -25,8 +25,8 @@ _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
 
 def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
-    """By part, whether each token of the prompt belongs to it, (T,) bool. No token belongs to two parts; those of the
-    chat template belong to none. Raises TrapsError where a part cannot be found."""
+    """Return, by part, whether each token of the prompt belongs to it, (T,) bool. No token belongs to two parts; those
+    of the chat template belong to none. Raises TrapsError where a part cannot be found."""
     ids, visual = prompt.inputs["input_ids"][0].tolist(), visual_tokens(model, prompt)
     texts = [
         "" if is_visual else _plain(model.processor.tokenizer.decode([token]))

@@ -49,8 +49,8 @@ class ClipMemory:
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
-        """Inside, a network's vision tower sees each clip once. What it returns is what it returned then. Inside
-        another such context nothing changes."""
+        """Let a network's vision tower see each clip once within the block. What it returns is what it returned then.
+        Inside another such context nothing changes."""
         owner = network.base_model
         original = getattr(owner, "get_video_features", None)
         if original is None or "get_video_features" in vars(owner):

@@ -162,7 +162,7 @@ class Futures:
             return Counter(pool.map(label, steps))
 
     def _settled(self, frames: np.ndarray) -> str | None:
-        """In which outcome a trajectory (F, nq) ends; None if it is undecided, or not for long enough."""
+        """Return the outcome in which a trajectory (F, nq) ends; None if it is undecided, or not for long enough."""
         control = self._control
         labels = control.family.outcome(replay(self._prepared.model, frames, control.physics), control.params).labels
         return labels[-1] if last_run(labels) <= len(labels) - 1 - self._held else None
@@ -246,8 +246,8 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
 
 
 def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> np.ndarray:
-    """By how much (m, rad) each degree of freedom may differ, for one standard deviation, where its body is seen from a
-    camera: a body by UNSEEN_PX, and what turns by so much at the point that is furthest from its middle. Shape
+    """Return how much (m, rad) each degree of freedom may differ, for one standard deviation, where its body is seen
+    from a camera: a body by UNSEEN_PX, and what turns by so much at the point that is furthest from its middle. Shape
     (nv,)."""
     import mujoco
 

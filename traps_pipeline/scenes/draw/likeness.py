@@ -33,18 +33,18 @@ def first_look(spec: SceneSpec, qpos: np.ndarray) -> int:
 
 
 def alike(looks: Mapping[str, int]) -> dict[str, str]:
-    """Record to another one that looks like it, of those that have one. looks: record to its hash."""
-    found = dict[str, str]()
+    """Return, for each record that looks like another, that other. looks: record to its hash."""
+    neighbour_of = dict[str, str]()
     for one, other in combinations(looks, 2):
         if (looks[one] ^ looks[other]).bit_count() <= NEAR_BITS:
-            found.setdefault(one, other)
-            found.setdefault(other, one)
-    return found
+            neighbour_of.setdefault(one, other)
+            neighbour_of.setdefault(other, one)
+    return neighbour_of
 
 
-def too_alike(looks: Mapping[str, int], new: int, wanted: int) -> str | None:
-    """Return the record that a new hash looks like, if with it more than NEAR_SHARE of the `wanted` have such
+def too_alike(looks: Mapping[str, int], new: int, count: int) -> str | None:
+    """Return the record that a new hash looks like, if with it more than NEAR_SHARE of `count` records have such
     another.
     """
     pairs = alike({**looks, "new": new})
-    return pairs.get("new") if len(pairs) > NEAR_SHARE * wanted else None
+    return pairs.get("new") if len(pairs) > NEAR_SHARE * count else None

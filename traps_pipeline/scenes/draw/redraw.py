@@ -99,12 +99,12 @@ def _rewritten(
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
     chosen = [id_ for id_ in records if only is None or id_ in only]
     jobs = [(records[id_], released / "trajectories", seed) for id_ in chosen]
-    for done, ((spec, folder, _), found) in enumerate(run_in_order(change, jobs, workers), start=1):
-        if isinstance(found, str):
-            rejected[spec.scenario_id] = found
+    for done, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
+        if isinstance(result, str):
+            rejected[spec.scenario_id] = result
         else:
-            save_trajectory(folder, spec.scenario_id, found.qpos, found.twin)
-            records[spec.scenario_id] = found.spec
+            save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
+            records[spec.scenario_id] = result.spec
         report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {done} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
     tallies = load_tallies(released)
@@ -117,14 +117,14 @@ def _rewritten(
 def _drawn_again(job: _Job) -> Resolved | str:
     """Return what the draw of a record gives today, under the record's names, or why it is rejected."""
     spec, _, seed = job
-    found = try_draw(Draw(spec.family, seed, spec.seed, frozenset(), tuple(sorted(get_family(spec.family).looks))))
-    if isinstance(found, str):
-        return found
-    worlds = [{field: value for field, value in each.params.items() if field != "look"} for each in (spec, found.spec)]
+    result = try_draw(Draw(spec.family, seed, spec.seed, frozenset(), tuple(sorted(get_family(spec.family).looks))))
+    if isinstance(result, str):
+        return result
+    worlds = [{field: value for field, value in each.params.items() if field != "look"} for each in (spec, result.spec)]
     if worlds[0] != worlds[1]:
         return "its draw gives another scene"
     names = {"scenario_id": spec.scenario_id, "ill_posed_question": spec.ill_posed_question}
-    return Resolved(found.spec.model_copy(update=names), found.qpos, found.twin)
+    return Resolved(result.spec.model_copy(update=names), result.qpos, result.twin)
 
 
 def _relooked(job: _Job) -> Resolved | str:
@@ -134,8 +134,8 @@ def _relooked(job: _Job) -> Resolved | str:
     look = look_of_draw(seed, spec.family, spec.seed, sorted(family.looks))
     qpos = load_trajectory(path, spec.trajectory_sha256)
     twin = load_trajectory(path, spec.twin.trajectory_sha256, "twin")
-    seen = with_look(spec, look, qpos, twin)
-    return seen if isinstance(seen, str) else Resolved(seen, qpos, twin)
+    result = with_look(spec, look, qpos, twin)
+    return result if isinstance(result, str) else Resolved(result, qpos, twin)
 
 
 def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
@@ -146,8 +146,8 @@ def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.nda
     other = spec.twin.params
     if other is not None:
         other = plain(params_to_dict(replace(family.params_from(other), look=look)))
-    seen = spec.model_copy(update={"params": dressed, "twin": spec.twin.model_copy(update={"params": other})})
-    pair, evidence = pair_of(seen, qpos, twin), dict(spec.evidence)
+    changed = spec.model_copy(update={"params": dressed, "twin": spec.twin.model_copy(update={"params": other})})
+    pair, evidence = pair_of(changed, qpos, twin), dict(spec.evidence)
     for certificate in certificates_for(spec.void_kind):
         if any(number.of_futures for number in certificate.numbers):
             continue  # thousands of rollouts, of which no picture is drawn
@@ -159,4 +159,4 @@ def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.nda
         if failure is not None:
             return f"{certificate.name}: {failure}"
         evidence |= certificate.kept(measured)
-    return seen.model_copy(update={"evidence": evidence})
+    return changed.model_copy(update={"evidence": evidence})

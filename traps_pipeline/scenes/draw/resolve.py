@@ -57,12 +57,12 @@ def resolve(
 ) -> Resolved:
     """Return the record of a scenario with its trajectories. Raises Rejected when it makes no valid pair."""
     physics = physics or family.physics
-    whole = _control(family, params, physics)
-    answer = whole.outcome.label
+    full = _control(family, params, physics)
+    answer = full.outcome.label
     if answer is not None and answer not in wording.labels:
         raise ValueError(f"{family.name}: reading {answer!r} is not one of the labels {list(wording.labels)}")
-    kind: VoidKind = "truncation" if whole.panel is None else "occluder"
-    pair, evidence = _of_some_length(whole, kind, wording, ill_posed_question, seed)
+    kind: VoidKind = "truncation" if full.panel is None else "occluder"
+    pair, evidence = _of_some_length(full, kind, wording, ill_posed_question, seed)
     control, physics = pair.control, pair.control.physics
     twin, frame = pair.other_world, pair.void_from
     panel = None if control.panel is None else asdict(control.panel)
@@ -99,18 +99,18 @@ def resolve(
 
 
 def _of_some_length(
-    whole: World, kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
+    full: World, kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
 ) -> tuple[Pair, Mapping[str, Any]]:
     """Return the pair of a simulated control, with all its evidence, of the first other world and the first length for
     which it has all certificates. Raises Rejected if there is none."""
     rejected = Rejected("no other hidden element gives another outcome")
-    for worlds in [(whole,)] if kind == "truncation" else _with_others(whole):
+    for worlds in [(full,)] if kind == "truncation" else _with_others(full):
         for n_frames in lengths(worlds, seed):
             control, *others = (cut_to(world, n_frames) for world in worlds)
             end_s = (n_frames - 1) / control.physics.fps
             answer = control.outcome.label
             claim = Claim(
-                whole.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question, seed
+                full.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question, seed
             )
             try:
                 pair = Pair(control, claim, futures_of(control, seed))
@@ -173,10 +173,10 @@ def _with_others(control: World) -> Iterator[tuple[World, World]]:
 
 def _cut_short(pair: Pair) -> list[Pair]:
     """Return the pair with the latest cut that leaves its outcome open, and a future of that cut as its twin."""
-    found = choose_cut(pair.futures, pair.claim, pair.control.outcome.commit_frame)
-    if found is None:
+    choice = choose_cut(pair.futures, pair.claim, pair.control.outcome.commit_frame)
+    if choice is None:
         raise Rejected("no cut at 1.0 s or later leaves the outcome open")
-    cut, twin = found
+    cut, twin = choice
     assert twin.qpos is not None
     other = _with_twin(pair, cut.frame, replace(pair.control, qpos=twin.qpos, simulated=None))
     return [replace(other, rollout=twin.number)]

@@ -117,8 +117,8 @@ def sample_family(
     answers = Counter(spec.ground_truth for spec in specs)
     texts = Counter(spec.ill_posed_question for spec in specs)
     looks = {} if len(specs) == count else {spec.scenario_id: first_look(spec, records.qpos(spec)) for spec in specs}
-    taken = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
-    places = [place for place in range(1, count + 1) if place not in taken]
+    occupied = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
+    places = [place for place in range(1, count + 1) if place not in occupied]
     if not places:
         return tally
 
@@ -126,24 +126,24 @@ def sample_family(
         for number in range(tally.draws, MOST_DRAWS * count):
             yield Draw(name, seed, number, _closed(answers, count, family), tuple(parts))
 
-    said: set[str] = set()  # kinds of rejections that the report has
+    reported: set[str] = set()  # kinds of rejections that the report has
     # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
     results = run_in_order(try_draw, jobs(), workers, ahead=len(places))
     try:
-        for draw, found in results:
+        for draw, result in results:
             tally.draws += 1
-            if isinstance(found, Resolved) and found.spec.ground_truth in _closed(answers, count, family):
-                found = f"answer {found.spec.ground_truth!r} has its quota"
-            picture = first_look(found.spec, found.qpos) if isinstance(found, Resolved) else 0
-            if isinstance(found, Resolved) and (other := too_alike(looks, picture, count)):
-                found = f"its first frame looks like that of another: {other}"
-            if isinstance(found, str):
-                tally.rejected[found.split(":")[0]] += 1
-                if kind_of(found) not in said:  # so that a family that never passes says why at once
-                    said.add(kind_of(found))
-                    report(f"{name}: draw {draw.number + 1} is rejected: {found}")
+            if isinstance(result, Resolved) and result.spec.ground_truth in _closed(answers, count, family):
+                result = f"answer {result.spec.ground_truth!r} has its quota"
+            picture = first_look(result.spec, result.qpos) if isinstance(result, Resolved) else 0
+            if isinstance(result, Resolved) and (other := too_alike(looks, picture, count)):
+                result = f"its first frame looks like that of another: {other}"
+            if isinstance(result, str):
+                tally.rejected[result.split(":")[0]] += 1
+                if kind_of(result) not in reported:  # so that a family that never passes says why at once
+                    reported.add(kind_of(result))
+                    report(f"{name}: draw {draw.number + 1} is rejected: {result}")
                 continue
-            placed = _named(family, found, draw, places.pop(0), texts, count)
+            placed = _named(family, result, draw, places.pop(0), texts, count)
             looks[placed.spec.scenario_id] = picture
             answers[placed.spec.ground_truth] += 1
             texts[placed.spec.ill_posed_question] += 1
@@ -187,9 +187,9 @@ class Records:
                 specs.append(SceneSpec.model_validate(json.loads(line)))
             except ValueError:  # a line that a kill tore
                 break
-        kept = [spec for spec in specs if spec.seed < tally.draws]
-        write_text(self._lines, "".join(record_line(spec) for spec in kept))
-        return kept
+        counted = [spec for spec in specs if spec.seed < tally.draws]
+        write_text(self._lines, "".join(record_line(spec) for spec in counted))
+        return counted
 
     def qpos(self, spec: SceneSpec) -> np.ndarray:
         """Return the trajectory of a record that was read."""
@@ -201,11 +201,11 @@ class Records:
         lines.sort(key=lambda line: json.loads(line)["scenario_id"])
         write_text(self._lines, "".join(f"{line}\n" for line in lines))
 
-    def append(self, found: Resolved, tally: Tally) -> None:
+    def append(self, resolved: Resolved, tally: Tally) -> None:
         """Add a scenario and note how far the drawing is."""
-        save_trajectory(self._released / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
+        save_trajectory(self._released / "trajectories", resolved.spec.scenario_id, resolved.qpos, resolved.twin)
         with self._lines.open("a", encoding="utf-8") as lines:
-            lines.write(record_line(found.spec))
+            lines.write(record_line(resolved.spec))
         save_tallies(self._released, load_tallies(self._released) | {self._family: tally})
 
 
@@ -271,11 +271,11 @@ def try_draw(draw: Draw) -> Resolved | str:
         return str(rejected)
 
 
-def _named(family: Family, found: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
+def _named(family: Family, resolved: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
     """Return the scenario with its id and an ill-posed question that its family still has room for."""
-    named = found.spec.model_copy(update={"scenario_id": f"{family.name}-{place:04d}"})
+    named = resolved.spec.model_copy(update={"scenario_id": f"{family.name}-{place:04d}"})
     question = ill_posed_for(named, draw.seed, texts, count)
-    return Resolved(named.model_copy(update={"ill_posed_question": question}), found.qpos, found.twin)
+    return Resolved(named.model_copy(update={"ill_posed_question": question}), resolved.qpos, resolved.twin)
 
 
 def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -> str:

@@ -41,10 +41,10 @@ def must_hide(pair: Pair) -> np.ndarray:
         until = max(world.outcome.commit_frame - 1, 0)
         decisive = decisive_geoms(world.model, world.scene.decisive)
         with world.renderer(supersample=1) as renderer:  # a margin is left, and certificates judge
-            whole = list(renderer.frames(world.qpos))
-            needed |= _differ(whole, renderer.frames(world.qpos, without=world.scene.hidden))
-            needed |= _differ(whole[until:], renderer.frames(world.qpos[until:], without=decisive))
-        drawn.append(whole)
+            full = list(renderer.frames(world.qpos))
+            needed |= _differ(full, renderer.frames(world.qpos, without=world.scene.hidden))
+            needed |= _differ(full[until:], renderer.frames(world.qpos[until:], without=decisive))
+        drawn.append(full)
     return needed | _differ(*drawn)
 
 
@@ -70,12 +70,12 @@ def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> 
 
 def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.ndarray:
     """Return where any frame differs from its other one, on the grid of 480x360."""
-    found = np.zeros((HEIGHT, WIDTH), bool)
+    masks = np.zeros((HEIGHT, WIDTH), bool)
     for frame, other in zip(frames, others, strict=True):
         unlike = (frame != other).any(axis=2)
         fine = unlike.shape[0] // HEIGHT
-        found |= unlike.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
-    return found
+        masks |= unlike.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
+    return masks
 
 
 def _directions(panel: Panel) -> tuple[np.ndarray, np.ndarray]:

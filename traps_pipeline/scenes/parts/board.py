@@ -112,7 +112,8 @@ class Board:
         return add_box(self.body, name, centre, half, colour, contype=0, conaffinity=0)
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
-        """Sill, head and sides around the part from `bottom` to `top`, and the glass over it, which is never drawn."""
+        """Add sill, head and sides around the part from `bottom` to `top`, and the glass over it, which is never
+        drawn."""
         side, outer, out = self.side, self.outer, (0, self.deep)
         if sill:
             self.block("sill", (-outer, outer), (bottom - 2 * WALL_M, bottom), out, colour)
@@ -123,7 +124,8 @@ class Board:
         glass.rgba, glass.friction, glass.priority = [1, 1, 1, 0], [0, 0, 0], 1
 
     def post(self, name: str, at: tuple[float, float], radius: float, colour: str, *, square: bool) -> None:
-        """A lively post from the board to the glass: round, or square with a corner up so that nothing rests on it."""
+        """Add a lively post from the board to the glass: round, or square with a corner up so that nothing rests on
+        it."""
         import mujoco
 
         half = self.deep / 2
@@ -139,7 +141,7 @@ class Board:
             post.quat = turned(math.pi / 4, 3)
 
     def divider(self, i: int, x: float, up: Span, half_m: float, colour: str) -> None:
-        """A wall `wall_<i>` between two buckets, and on it a post `tip_<i>`: a flat end could hold a ball."""
+        """Add a wall `wall_<i>` between two buckets, and on it a post `tip_<i>`: a flat end could hold a ball."""
         self.block(f"wall_{i}", (x - half_m, x + half_m), up, (0, self.deep), colour)
         self.post(f"tip_{i}", (x, up[1]), half_m, colour, square=True)
 
@@ -154,7 +156,7 @@ class Board:
         square: bool,
         where: Callable[[float, float], bool] = lambda across, up: True,
     ) -> None:
-        """Rows of pegs from side to side, without those that leave a ball just enough room to jam at a side.
+        """Add rows of pegs from side to side, without those that leave a ball just enough room to jam at a side.
 
         heights: up the board; shifts: sideways; one a row. gap: from peg to peg. where: whether a peg may stand at a
         place (across, up).

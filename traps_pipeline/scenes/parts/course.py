@@ -135,7 +135,7 @@ class Course:
         colour: str,
         surface: Surface | None = None,
     ) -> None:
-        """The walls `<name>_front` and `<name>_back` outside a width, the front one first."""
+        """Add the walls `<name>_front` and `<name>_back` outside a width, the front one first."""
         for part, across in (("front", (-half_width - thick, -half_width)), ("back", (half_width, half_width + thick))):
             self.block(f"{name}_{part}", along, across, up, colour, surface)
 
@@ -302,7 +302,7 @@ class Course:
         solref: tuple[float, float] | None = None,
         base: float = 0.0,
     ) -> None:
-        """Free boxes one on top of the other, at the origin, the first on the ground or so high (m)."""
+        """Add free boxes one on top of the other, at the origin, the first on the ground or so high (m)."""
         height = 2 * half[2]
         for i, (name, colour) in enumerate(zip(names, colours, strict=True)):
             at = (0.0, 0.0, base + (i + 0.5) * height)
@@ -333,7 +333,7 @@ class Course:
     # --- what stands for hidden things ---
 
     def mark(self, phrase: str, at: str | tuple[float, float], colour: str | None = None) -> None:
-        """A flag over the panel for what a question names and the panel hides. It is drawn only, and is the same
+        """Add a flag over the panel for what a question names and the panel hides. It is drawn only, and is the same
         whatever the hidden element is: so it may stand only where something is in every world, or begins.
 
         at: the geom, or the body at its start, behind which it stands, or a place (along, across). colour: None takes

@@ -69,7 +69,8 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """For every parameter that varies, the row that each scene falls into: its value, or the quarter that holds it."""
+    """Return, for every parameter that varies, the row that each scene falls into: its value, or the quarter that holds
+    it."""
     columns = {}
     for name in sorted(set().union(*scenes)):
         values = [scene.get(name) for scene in scenes]

@@ -172,8 +172,8 @@ def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         colours = coloured(p)
-        taken = [colours[one] for one in unlike]
-        others = [str(c) for c in rng.permutation([c for c in pool if c not in taken])[:2]]
+        excluded = [colours[one] for one in unlike]
+        others = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
         return choice_of(question, lambda p: [colours[part], *others], lambda p: colours[part])(p, rng)
 
     return ask

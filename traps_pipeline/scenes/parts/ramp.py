@@ -61,7 +61,7 @@ class Ramp:
         return geom
 
     def support(self, course: Course, name: str, up: float, under: float, half_width: float, colour: str) -> None:
-        """A post from the ground to so far under the surface."""
+        """Add a post from the ground to so far under the surface."""
         x, y, z = self.at(up, -under)
         half = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
         course.slab(name, (x, y, z / 2), half, colour)

@@ -44,7 +44,7 @@ def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
 
 
 def undecided(motion: Motion) -> Labels:
-    """No label in any frame: a run that has no valid outcome."""
+    """Return no label for any frame: a run that has no valid outcome."""
     return [None] * len(motion.times)
 
 

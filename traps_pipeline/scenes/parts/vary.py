@@ -67,7 +67,7 @@ def one_of(*values: Any) -> Any:
 
 
 def chance(share: float) -> Any:
-    """True in this share of the draws."""
+    """Return a boolean field that is true in this share of the draws."""
     return drawn_by(lambda rng, so_far: bool(rng.random() < share))
 
 
@@ -114,11 +114,12 @@ def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
 
 
 def shuffled(*values: Any, without: str | None = None) -> Group:
-    """Different ones of these values in random order; not the one that the field named `without` has."""
+    """Return a group that draws different ones of these values, in random order; not the one that the field named
+    `without` has."""
 
     def draw(rng: np.random.Generator, so_far: Drawn, count: int) -> Sequence[Any]:
-        left = [value for value in values if without is None or value != so_far[without]]
-        return [left[int(i)] for i in rng.permutation(len(left))[:count]]
+        pool = [value for value in values if without is None or value != so_far[without]]
+        return [pool[int(i)] for i in rng.permutation(len(pool))[:count]]
 
     return Group(draw, values)
 
@@ -239,8 +240,8 @@ def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Genera
     values = list(group.draw(rng, so_far, sum(numbers.values())))
     values_drawn: Drawn = {}
     for name, number in numbers.items():
-        taken, values = values[:number], values[number:]
-        values_drawn[name] = taken[0] if counts[name] is None else tuple(taken)
+        chosen, values = values[:number], values[number:]
+        values_drawn[name] = chosen[0] if counts[name] is None else tuple(chosen)
     return values_drawn
 
 

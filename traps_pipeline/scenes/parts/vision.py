@@ -153,12 +153,12 @@ def _stands_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
     """Return whether a large region has this colour soon after frame `comes`, and at the end, that had another one
     before: in the last frame, and some frames ago, when nothing that goes again had covered it."""
     ago, soon = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
-    before, was, there, stays = (_apart(frames[at], colour) <= ALIKE for at in (comes - 1, ago, soon, -1))
+    before, was, soon_after, stays = (_apart(frames[at], colour) <= ALIKE for at in (comes - 1, ago, soon, -1))
     stands = stays & ~before & ~was
     closed = cv2.morphologyEx(
         stands.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
     )  # lines between slats
-    return bool(closed.sum() >= PANEL_PX and (there & stands).sum() > 0.9 * stands.sum())
+    return bool(closed.sum() >= PANEL_PX and (soon_after & stands).sum() > 0.9 * stands.sum())
 
 
 def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
@@ -185,10 +185,10 @@ def moved(frames: np.ndarray) -> np.ndarray:
 
 def before_hold(frames: np.ndarray) -> np.ndarray:
     """Return the frames without those at the end in which nothing moves any more; at least one."""
-    shown = len(frames)
-    while shown > 1 and moved(frames[:shown]).sum() < MOVED_PX:
-        shown -= 1
-    return frames[:shown]
+    count = len(frames)
+    while count > 1 and moved(frames[:count]).sum() < MOVED_PX:
+        count -= 1
+    return frames[:count]
 
 
 def still(frames: np.ndarray) -> bool:
@@ -197,7 +197,7 @@ def still(frames: np.ndarray) -> bool:
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """By how many levels two pictures of bytes differ, pixel by pixel, in the channel where they differ most."""
+    """Return by how many levels two pictures of bytes differ, pixel by pixel, in the channel where they differ most."""
     apart = np.maximum(a, b) - np.minimum(a, b)
     return np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])  # 20 times as fast as max(axis=-1)
 
@@ -209,7 +209,7 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
     black flag the mast is told apart only below.
     """
     still = np.median(frames, axis=0).astype(np.uint8)
-    shown = frames.copy()
+    painted = frames.copy()
     for left, top, width in _masts(still):
         for seed in ((left + width + 3, top + 5), (left + width + 3, top - 4)):
             patch = _patch(still, seed)
@@ -222,10 +222,10 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
             if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12 or rests > 0.03:
                 continue  # neither flies at the end of the mast, or it moves
             above = max(0, min(top, y) - 4)
-            beside = shown[:, above, max(0, left - 4)]
-            shown[:, above + 2 : y + high + 3, left - 1 : x + wide + 3] = beside[:, None, None]
+            beside = painted[:, above, max(0, left - 4)]
+            painted[:, above + 2 : y + high + 3, left - 1 : x + wide + 3] = beside[:, None, None]
             break
-    return shown
+    return painted
 
 
 def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
@@ -260,10 +260,10 @@ def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
 def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:
     """Return whether the tracked thing is seen in each of the last frames and stays where it is."""
     tail = path[-last:]
-    seen = [blob for blob in tail if blob is not None]
-    if len(seen) < last:
+    visible = [blob for blob in tail if blob is not None]
+    if len(visible) < last:
         return False
-    xs, ys = [blob.x for blob in seen], [blob.y for blob in seen]
+    xs, ys = [blob.x for blob in visible], [blob.y for blob in visible]
     return max(xs) - min(xs) <= tolerance_px and max(ys) - min(ys) <= tolerance_px
 
 

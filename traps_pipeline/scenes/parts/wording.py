@@ -20,14 +20,14 @@ from traps_pipeline.scenes.physics.kit import COLOURS, Inventory, Taxonomy
 @cache
 def _pattern(template: str) -> re.Pattern[str]:
     parts = re.split(r"\{(\w+)\}", template)
-    seen: set[str] = set()
+    named: set[str] = set()
     pattern = ""
     for i, part in enumerate(parts):
         if i % 2 == 0:
             pattern += re.escape(part)
         else:
-            pattern += f"(?P={part})" if part in seen else f"(?P<{part}>.+?)"
-            seen.add(part)
+            pattern += f"(?P={part})" if part in named else f"(?P<{part}>.+?)"
+            named.add(part)
     return re.compile(pattern)
 
 
@@ -209,8 +209,8 @@ def colour_distance(one: str, other: str) -> float:
     """Return least Euclidean distance in CIELAB (D65) of a named colour from another one, in shade and in bright light
     too."""
     known = {**COLOURS, **_ELSEWHERE}
-    seen = (tuple(min(1.0, light * part) for part in known[other]) for light in LIGHTS)
-    return min(float(np.linalg.norm(_lab(known[one]) - _lab(as_lit))) for as_lit in seen)
+    lit = (tuple(min(1.0, light * part) for part in known[other]) for light in LIGHTS)
+    return min(float(np.linalg.norm(_lab(known[one]) - _lab(as_lit))) for as_lit in lit)
 
 
 def _lab(srgb: Sequence[float]) -> np.ndarray:

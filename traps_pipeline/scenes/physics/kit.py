@@ -170,7 +170,8 @@ class Motion:
         return self.rotations[body]
 
     def places(self, body: str, beside_m: float) -> np.ndarray:
-        """By what a body is seen to move, (F, N, 3) m: its middle and points beside it, or a soft body's vertices."""
+        """Return the points by which a body is seen to move, (F, N, 3) m: its middle and points beside it, or a soft
+        body's vertices."""
         if body in self.vertices:
             return self.vertices[body]
         beside = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))

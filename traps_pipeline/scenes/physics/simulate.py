@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """qvel at the start: each named free body gets its six numbers, each named soft body the first three, by which all
-    of it moves. Shape (nv,)."""
+    """Return qvel at the start: each named free body gets its six numbers, each named soft body the first three, by
+    which all of it moves. Shape (nv,)."""
     qvel, soft = np.zeros(model.nv), flexes(model)
     for body, values in velocity.items():
         if body in soft:
@@ -29,7 +29,8 @@ def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[floa
 
 
 def simulate(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
-    """qpos at every frame time, shape (F, nq), float32: what is frozen and replayed. Raises if the solver diverges."""
+    """Return qpos at every frame time, shape (F, nq), float32: what is frozen and replayed. Raises if the solver
+    diverges."""
     import mujoco
 
     data = mujoco.MjData(model)

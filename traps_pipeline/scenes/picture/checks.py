@@ -36,8 +36,8 @@ class PastPanel:
 
     def hidden_from(self) -> int:
         """Return first frame from which no decisive body has a pixel until the end; the number of frames if none is."""
-        seen = np.flatnonzero(self.decisive)
-        return int(seen[-1]) + 1 if seen.size else 0
+        showing = np.flatnonzero(self.decisive)
+        return int(showing[-1]) + 1 if showing.size else 0
 
     def leaked(self, first: int) -> float:
         """Return pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the panel
@@ -53,13 +53,14 @@ def past_panel(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hi
 
 
 def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
-    """From how many frames to the next a body is seen to move: it has at least so many pixels in both and goes so far.
+    """Count the steps between frames in which a body is seen to move: it has at least so many pixels in both and goes
+    so far.
 
     pixels (F,), places (F, 2) in pixels.
     """
     moves = np.abs(np.diff(places, axis=0)).max(axis=1) >= step_px
-    seen = pixels >= least_px
-    return int((moves & seen[1:] & seen[:-1]).sum())
+    visible = pixels >= least_px
+    return int((moves & visible[1:] & visible[:-1]).sum())
 
 
 def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> float:
@@ -100,7 +101,8 @@ def ablation_pixels(
 
 
 def differing_pixels(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> tuple[int, int]:
-    """Over all frames of two worlds: how many pixels differ, and the largest difference of a channel (0-255)."""
+    """Return, over all frames of two worlds, how many pixels differ, and the largest difference of a channel
+    (0-255)."""
     pixels, largest = 0, 0
     for a, b in zip(frames, others, strict=True):
         if not np.array_equal(a, b):

@@ -171,8 +171,8 @@ class Renderer:
                 pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
                 shapes = self._scene.geoms[: self._scene.ngeom]
                 drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
-                seen = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
-                counts[i] = [seen.get(thing, 0) / self._scale**2 for thing in things]
+                counted = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
+                counts[i] = [counted.get(thing, 0) / self._scale**2 for thing in things]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return counts
@@ -191,8 +191,8 @@ class Renderer:
 
         self._data.qpos[:] = qpos
         self._place()
-        wanted = (*self._places(panel, without), panel, self._comes, tuple(without), self._scene.flags.tobytes())
-        if wanted == self._drawn:
+        state = (*self._places(panel, without), panel, self._comes, tuple(without), self._scene.flags.tobytes())
+        if state == self._drawn:
             return self._pixels
         self._drawn = None
         option = mujoco.MjvOption()
@@ -218,7 +218,7 @@ class Renderer:
         viewport = mujoco.MjrRect(0, 0, self._width, self._height)
         mujoco.mjr_render(viewport, self._scene, self._context)
         self._read()
-        self._drawn = wanted
+        self._drawn = state
         return self._pixels
 
     def _add_haze(self) -> None:
@@ -245,15 +245,16 @@ class Renderer:
         model, data = self._model, self._data
         gone = [self._number(name) for name in without if not self._is_soft(name)]
         groups = model.geom_group
-        shown = (groups != REMOVED_GROUP) & ((groups != PANEL_GROUP) | panel)
-        shown &= (groups != COMING_GROUP) | self._comes
-        shown[gone] = False
-        places = (data.geom_xpos[shown], data.geom_xmat[shown], data.light_xpos, data.light_xdir)
+        drawn = (groups != REMOVED_GROUP) & ((groups != PANEL_GROUP) | panel)
+        drawn &= (groups != COMING_GROUP) | self._comes
+        drawn[gone] = False
+        places = (data.geom_xpos[drawn], data.geom_xmat[drawn], data.light_xpos, data.light_xdir)
         more = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)
         return (*(values.tobytes() for values in places), more.tobytes())
 
     def _place(self) -> None:
-        """Where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no dynamics)."""
+        """Compute where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no
+        dynamics)."""
         import mujoco
 
         for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):

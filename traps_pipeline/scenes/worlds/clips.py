@@ -173,11 +173,11 @@ def _leaked_pixels(
     comes."""
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
-    seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
+    past_panel_px = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
     hiding = [frame for frame in still if frame >= first]
     ablated = [hiding[i] for i in np.unique(np.linspace(0, len(hiding) - 1, ABLATION_FRAMES).astype(int))]
-    whole = [void[frame] for frame in ablated]
-    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], whole)
+    complete = [void[frame] for frame in ablated]
+    return past_panel_px + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], complete)
 
 
 def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:

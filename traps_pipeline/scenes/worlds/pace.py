@@ -35,7 +35,7 @@ TRIES = 4  # moments at which it is tried to close a control
 
 
 def settles_share(commit_frame: int, n_frames: int) -> float:
-    """After which share of a clip's frames its outcome settles."""
+    """Return the share of a clip's frames after which its outcome settles."""
     return commit_frame / n_frames
 
 

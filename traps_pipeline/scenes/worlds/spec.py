@@ -215,8 +215,8 @@ def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.n
 
 
 def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """qpos at frame times (F, nq) float32 of the scenario or its twin. Raises ValueError naming a missing or altered
-    file."""
+    """Return qpos at frame times (F, nq) float32 of the scenario or its twin. Raises ValueError naming a missing or
+    altered file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             qpos = archive[world]

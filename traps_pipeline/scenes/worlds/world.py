@@ -122,9 +122,12 @@ class World:
     @property
     def outcome_read(self) -> Outcome:
         """What the frames before the closing come to, by themselves: what there is to be read."""
-        shown, whole = slice(0, self.open_frames), self.motion
-        parts = ({k: v[shown] for k, v in each.items()} for each in (whole.positions, whole.rotations, whole.vertices))
-        return read_outcome(self.family, Motion(whole.times[shown], *parts), self.params)
+        open_frames, motion = slice(0, self.open_frames), self.motion
+        parts = (
+            {k: v[open_frames] for k, v in each.items()}
+            for each in (motion.positions, motion.rotations, motion.vertices)
+        )
+        return read_outcome(self.family, Motion(motion.times[open_frames], *parts), self.params)
 
     @cached_property
     def resimulated(self) -> np.ndarray:
@@ -191,8 +194,8 @@ class World:
         missing = [frame for frame in which if frame not in self._segmented]
         if missing:
             with self.closed_renderer() as renderer:
-                seen = renderer.visible_pixels(self.qpos[missing], self.geoms, panel=True)
-            self._segmented.update(zip(missing, seen, strict=True))
+                counts = renderer.visible_pixels(self.qpos[missing], self.geoms, panel=True)
+            self._segmented.update(zip(missing, counts, strict=True))
         columns = [self.geoms.index(name) for name in names]
         return np.array([self._segmented[frame][columns].sum() for frame in which])
 
@@ -204,10 +207,10 @@ class World:
         """Return how many pixels change behind the panel, over some frames, when geoms are taken away."""
         missing = [frame for frame in which if (frame, geoms) not in self._ablated]
         if missing:
-            whole = self.behind_panel(missing)
+            complete = self.behind_panel(missing)
             with self.closed_renderer() as renderer:
                 without = void_frames(renderer, self.qpos[missing], without=geoms)
-                for frame, one, other in zip(missing, whole, without, strict=True):
+                for frame, one, other in zip(missing, complete, without, strict=True):
                     self._ablated[frame, geoms] = differing_pixels([one], [other])[0]
         return sum(self._ablated[frame, geoms] for frame in which)
 
