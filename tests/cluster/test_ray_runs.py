@@ -7,7 +7,6 @@ import os
 import shlex
 import threading
 import time
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,18 +19,16 @@ from tests.postgres import Postgres
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Progress, reporting
-from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.benchmark.videos import CLIPS
 from traps_pipeline.cluster.ray_runs import RayRuns
 from traps_pipeline.cluster.requests import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.cluster.same_code import code_here, installed, require_same_code
-from traps_pipeline.cluster.shared_history import HISTORY, LOGS, dagster_yaml, export
+from traps_pipeline.cluster.shared_history import HISTORY, LOGS, dagster_yaml
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.runs import broke_off, range_tags
-from traps_pipeline.pipeline.schemes import CATEGORY, DATASET
+from traps_pipeline.pipeline.schemes import DATASET
 from traps_pipeline.pipeline.stages import benchmark_stages
 from traps_pipeline.pipeline.step import RESUMED_ELSEWHERE, end_if_resumed
 from traps_pipeline.pipeline.translation import asset_key
@@ -82,31 +79,6 @@ def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
     for given, used in (("1", 1), ("100000", here), ("", here)):
         monkeypatch.setenv("TRAPS_CORES", given)
         assert cores() == used
-
-
-def test_rendering_is_as_many_runs_as_the_missing_clips_are_worth(workspace: Workspace) -> None:
-    """The 702 scenarios have 2,106 clips of 1.4 s; their records take 0.04 s each: 2,977 s of one core."""
-    stages = [the_graph()[name] for name in (SCENE_SPECS.name, VIDEOS.name)]
-    keys = [*CATEGORY.keys]
-    with dg.DagsterInstance.ephemeral() as instance:
-
-        def ranges(most: int, cpus: int = 1) -> list[Any]:
-            return RayRuns(instance, workspace, most, 0.0, "leave", cpus).ranges(stages, keys)
-
-        by_category = Counter(ranges(40))
-        assert by_category.total() == 24 and len(by_category) == 12  # of 120 s at least, and none without a run
-        assert by_category["tumbling_dice", "tumbling_dice"] > by_category["collisions", "collisions"] == 1
-        assert ranges(5) == [(keys[0], keys[-1])] * 5
-        assert ranges(40, 4) == [(keys[0], keys[-1])] * 6  # with four cores each, a fourth
-        for one in load_released().values():
-            for side in CLIPS:
-                path = workspace.clip(one.scenario_id, side, one.scene_hash)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.touch()
-        assert ranges(40) == [(keys[0], keys[-1])]
-        assert RayRuns(instance, workspace, 40, 0.0, "leave").ranges([the_graph()["metrics"]], ["chaotic"]) == [
-            ("chaotic", "chaotic")
-        ]  # fmt: skip
 
 
 class Shown(Progress):
@@ -279,33 +251,6 @@ def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path:
             end_if_resumed(instance, run.run_id, 0)
             os._exit(0)
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == RESUMED_ELSEWHERE
-
-
-@pytest.mark.slow
-def test_a_run_keeps_its_connections_and_survives_a_restart_of_the_server(
-    remote: Workspace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
-    import psycopg
-
-    with Postgres.running() as server:
-        with psycopg.connect(server.address(), autocommit=True) as connection:
-            connection.execute("alter system set log_connections to on")
-            connection.execute("select pg_reload_conf()")
-        monkeypatch.setenv("LAB_DATABASE", server.address())
-        with dagster_history(remote):
-            pass
-        export(remote, is_kept=True)
-        with dg.DagsterInstance.from_config(str(remote.dagster_home)) as instance:
-            log = server.folder / "log"
-            opened = log.read_text().count("connection authorized")
-            for number in range(20):
-                instance.report_runless_asset_event(dg.AssetMaterialization("clips", partition=f"{number}"))
-            assert log.read_text().count("connection authorized") - opened < 5  # by itself it makes two for each
-            server.stop()
-            server.start()
-            instance.report_runless_asset_event(dg.AssetMaterialization("clips", partition="20"))
-            assert len(instance.get_materialized_partitions(dg.AssetKey("clips"))) == 21
 
 
 @dg.op

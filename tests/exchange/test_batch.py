@@ -1,12 +1,12 @@
-"""Batches: what goes out is what a live call sends, and what comes back is read as a live call reads it."""
+"""Batches: media by reference, failures of every form, and what is no answer.
+
+`integration/test_batches.py` asks a whole study through them."""
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import datetime
 import json
-import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.build.errors import raises
-from tests.conftest import KEY, SECRET
+from tests.conftest import KEY
 from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.checks import loopback
@@ -22,8 +22,6 @@ from traps_pipeline.checks.live_check import requests_of
 from traps_pipeline.exchange import provider_batch
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.models import api
-from traps_pipeline.models.api import ApiBackend
-from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
 from traps_pipeline.models.request import Request
 
@@ -33,7 +31,7 @@ Entries = Callable[[str], Entry]
 
 @pytest.fixture
 def entry_at(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Entries:
-    """A model at the provider, by the route of its API, or a judge."""
+    """A model at the provider, by the route of its API."""
 
     def made(kind: str) -> Entry:
         version = "v1beta" if kind == "gemini" else "v1"
@@ -41,9 +39,6 @@ def entry_at(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Entries:
         for module in (api, loopback):
             monkeypatch.setattr(module, "load_accounts", lambda: {"here": account})
         fields: dict[str, Any] = {"id": "m", "backend": "api", "account": "here", "prices": PRICES}
-        if kind == "judge":
-            fields |= {"provider_id": "openai/m", "params": {"temperature": 0.8, "max_tokens": 512}}
-            return JudgeEntry.model_validate(fields, context={"accounts": {"here": account}})
         fields |= {"provider_id": f"{kind}/m", "params": {name: value for name, (_, value) in PROTOCOL.items()}}
         fields |= {"media": {"profile": "images", "fps": 5, "most": 25}}
         return ModelEntry.model_validate(fields, context={"accounts": {"here": account}})
@@ -51,46 +46,8 @@ def entry_at(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Entries:
     return made
 
 
-def served(provider: Provider, line: dict[str, Any]) -> dict[str, Any]:
-    """What the provider's batch mode returns for a line: its own live answer to the body, in the form of a batch."""
-    is_gemini = "request" in line
-    path = "/v1beta/models/m:generateContent" if is_gemini else line["url"]
-    body = json.dumps(line["request"] if is_gemini else line["body"]).encode()
-    headers = {"Authorization": f"Bearer {SECRET}", "content-type": "application/json"}
-    with urllib.request.urlopen(urllib.request.Request(provider.url + path, body, headers)) as answer:
-        said = json.load(answer)
-    if is_gemini:
-        return {"key": line["key"], "response": said}
-    return {"custom_id": line["custom_id"], "response": {"status_code": 200, "body": said}, "error": None}
-
-
 def by_key(entry: Entry) -> dict[str, Request]:
     return {request.key: request for request in requests_of(entry).values()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["openai", "gemini", "judge"])
-def test_a_round_trip_through_files_gives_the_outcomes_of_the_live_path(
-    kind: str, entry_at: Entries, provider: Provider, tmp_path: Path
-) -> None:
-    entry = entry_at(kind)
-    wanted = by_key(entry)
-    (file,), count = export_batches({entry.id: (entry, wanted.values())}, tmp_path)
-    assert count == len(wanted) == 3 and SECRET not in file.read_text()
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    results = tmp_path / "results.jsonl"
-    results.write_text("".join(json.dumps(served(provider, line)) + "\n" for line in lines))
-    assert is_batch(results)
-    found = {
-        request.key: outcome for request, outcome in outcomes_of({"m": entry}, wanted, read_batch(results, wanted))
-    }
-    backend = ApiBackend(entry)
-
-    async def live() -> dict[str, Any]:
-        return {key: await backend.ask(request) for key, request in wanted.items()}
-
-    assert found == asyncio.run(live())
-    assert all(outcome.kind == "answer" and outcome.cost_usd for outcome in found.values())
 
 
 def inlined(value: Any, folder: Path) -> Any:
@@ -164,13 +121,6 @@ def test_a_line_that_is_not_wanted_or_not_known_is_named_and_nothing_is_imported
         read_batch(path, {"k": Request("m", "openai/m", {}, "", "", {})})
 
 
-def test_anthropics_message_is_what_a_live_call_gets(tmp_path: Path) -> None:
-    line = {"custom_id": "a", "result": {"type": "succeeded", "message": {"id": "msg"}}}
-    (tmp_path / "results.jsonl").write_text(json.dumps(line) + "\n")
-    found = read_batch(tmp_path / "results.jsonl", {"a": Request("m", "anthropic/m", {}, "", "a", {})})
-    assert found["a"].status == 200 and json.loads(found["a"].body) == {"id": "msg"}
-
-
 BODY = {"message": "too long", "type": "BadRequestError", "param": None, "code": 400}
 
 
@@ -187,15 +137,12 @@ def message_line(kind: str, **more: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("route", "line", "error"),
     [
-        ("openai", chat_line(None, error={"code": "batch_expired", "message": "late"}), "batch_expired"),
-        ("openai", chat_line(400, {"error": BODY}), "http_400"),
         ("openai", chat_line(500, {"error": BODY}), "server_error"),
         ("openai", chat_line(400, error={"error": BODY}), "http_400"),  # vLLM, and an earlier one
         ("openai", chat_line(400, error={"object": "error"} | BODY), "http_400"),
         ("gemini", {"key": "k", "error": {"code": 503, "status": "UNAVAILABLE", "message": "x"}}, "batch_503"),
         ("gemini", {"key": "k", "error": {"status": "CANCELLED", "message": "x"}}, "batch_cancelled"),
         ("anthropic", message_line("expired"), "batch_expired"),
-        ("anthropic", message_line("canceled"), "batch_canceled"),
         ("anthropic", message_line("errored", error={"type": "error"}), "batch_errored"),
     ],
 )

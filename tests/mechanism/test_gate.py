@@ -51,9 +51,9 @@ def test_gating_turns_answers_into_abstentions_and_nothing_else() -> None:
     assert drawn["acc"].tolist() == pytest.approx([2 / 3]) and drawn["abs_rec"].tolist() == [0.0]
 
 
-@pytest.mark.parametrize("n", [2, 12, 200])
 @pytest.mark.parametrize("right", [0.0, 1.0])
-def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(n: int, right: float) -> None:
+def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(right: float) -> None:
+    n = 12
     void = np.tile([False, True], n)
     outcomes = Outcomes(void, np.where(void, np.nan, right), np.where(void, right, 0.0))
     names = np.repeat([f"occlusion-{number:03d}" for number in range(n)], 2)

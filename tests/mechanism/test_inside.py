@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -14,53 +13,39 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from tests.build.mechanism import STANDARD, entry, patch
+from tests.build.mechanism import study as extracted
 from tests.conftest import ROOT
-from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_verdicts
+from tests.mechanism.study import PAIRS, write_verdicts
 from tools.inside_notebook import cells, execute
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.baselines import RAW, output_margins
+from traps_pipeline.mechanism.baselines import RAW
 from traps_pipeline.mechanism.deciding import ABSTENTION
 from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.other_probes import Eraser
-from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probes import scenario_folds
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.protocol.cells import Extraction, StatesCell
-from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.workspace import Workspace
 
+__all__ = ["entry", "extracted", "patch"]  # fixtures
+
 pytestmark = pytest.mark.slow
-STANDARD = Extraction("tiny", "standard")
 
 
 @pytest.fixture(scope="module")
-def entry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModelEntry]:
-    with pytest.MonkeyPatch.context() as patch:
-        made = tiny_entry(tmp_path_factory.mktemp("tiny") / "checkpoint")
-        register(patch, made)
-        yield made
-
-
-@pytest.fixture(scope="module")
-def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    workspace = make_study(tmp_path_factory.mktemp("study"))
-    for dataset in (*DATASETS, ANSWERABLE, TIME_SWAPPED):
-        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
-        cell = StatesCell(dataset, STANDARD)
-        workspace.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(workspace, cell)[0], {})
-    workspace.tables.write(DIRECTIONS, STANDARD.partition, stages.direction_rows(workspace, STANDARD), {})
-    write_verdicts(workspace, "chaotic", {f"plinko-{n}": n < 2 for n in range(PAIRS)})
-    return workspace
+def study(extracted: Workspace) -> Workspace:
+    """Extracted, with directions, and judged on one dataset."""
+    write_verdicts(extracted, "chaotic", {f"plinko-{n}": n < 2 for n in range(PAIRS)})
+    return extracted
 
 
 def test_the_page_runs_as_it_is_written(study: Workspace) -> None:
@@ -81,34 +66,6 @@ def test_states_stand_beside_their_items_and_verdicts(study: Workspace) -> None:
     assert states.where(states.void).items["side"].unique().tolist() == ["void"]
     with pytest.raises(TrapsError, match="no hidden states of decoy"):
         inside.load(study.root, "tiny", layer=2, datasets=["decoy"])
-
-
-def test_states_probes_and_margins_equal_plain_transformers_and_scikit_learn(
-    study: Workspace, entry: ModelEntry
-) -> None:
-    """An independent re-implementation: the library's own hidden_states, StandardScaler and LogisticRegression, and
-    logits of whole passes."""
-    model, own = load_local_model(entry), StoredStates.of(study, STANDARD)
-    items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).set_index("item_id")
-    assert entry.media is not None
-    vectors, margins, tokens = [], [], abstention_tokens(model)
-    for name in own.dataset("chaotic")["item_id"]:
-        shown = sample(study.resolve(items.loc[name, "clip"]), entry.media)
-        prompt = model.prompt(vqa_prompt("standard"), items.loc[name, "question"], shown.frames, shown.times_s)
-        with torch.no_grad():
-            out = model.network(**prompt.inputs, output_hidden_states=True)
-        vectors.append(out.hidden_states[2][0, -1].numpy())
-        chance = torch.softmax(out.logits[0, -1].double(), 0)
-        chance[model.network.generation_config.suppress_tokens or []] = 0
-        margins.append(float(torch.log(chance[tokens].sum()) - torch.log(chance.sum() - chance[tokens].sum())))
-    assert (np.stack(vectors) == own.read("chaotic", 2)).all()
-    assert output_margins(entry, own, ["chaotic"])["chaotic"][:, 0] == pytest.approx(margins, abs=1e-4)
-    void = (own.dataset("chaotic")["side"] == "void").to_numpy()
-    scaled = StandardScaler().fit(np.stack(vectors).astype(float))
-    plain = LogisticRegression(solver="newton-cg", tol=1e-12, max_iter=10_000).fit(scaled.transform(vectors), void)
-    other = inside.load(study, "tiny", layer=2, datasets=["occlusion"])
-    ours = inside.fit_probe(own.read("chaotic", 2), void).scores(other.X)
-    assert ours == pytest.approx(plain.decision_function(scaled.transform(other.X.astype(float))), abs=1e-5)
 
 
 def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry: ModelEntry) -> None:

@@ -37,7 +37,7 @@ from traps_pipeline.mechanism.untrained import untrained_states
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prompt
+from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS
@@ -211,11 +211,6 @@ def own_prompt(workspace: Workspace, entry: ModelEntry, row: dict, system: str) 
 
 
 # --- the benchmark's own prompts --------------------------------------------------------------------------------------
-
-
-def test_the_prompt_of_states_is_the_papers_or_the_benchmarks_own() -> None:
-    for name in ("standard", "guided"):
-        assert states_prompt("vqa", name) == vqa_prompt(name) != system_prompt(name) == states_prompt("benchmark", name)
 
 
 def test_states_under_the_benchmarks_own_prompt_have_other_keys_and_are_the_librarys(

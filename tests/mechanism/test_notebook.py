@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 from tests.conftest import ROOT
 from tools.inside_notebook import cells, execute
@@ -24,16 +23,6 @@ def test_the_notebook_is_its_page_with_what_every_cell_printed_and_drew() -> Non
     ]
     assert plain == cells(page), "docs/inside.md was changed: run `python -m tools.inside_notebook`"
     assert (written["nbformat"], written["nbformat_minor"]) == (4, 5)
-
-
-def test_code_cells_are_the_blocks_and_text_is_all_the_rest() -> None:
-    page = (DOCS / "inside.md").read_text(encoding="utf-8")
-    made = cells(page)
-    code = ["".join(cell["source"]) for cell in made if cell["cell_type"] == "code"]
-    assert [f"{block}\n" for block in code] == re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-    text = "".join("".join(cell["source"]) for cell in made if cell["cell_type"] == "markdown")
-    rest = re.sub(r"^```python\n.*?^```$", "", page, flags=re.DOTALL | re.MULTILINE)
-    assert "".join(text.split()) == "".join(rest.split())
 
 
 def test_a_page_by_hand_is_run_and_what_it_prints_and_draws_is_kept() -> None:

@@ -51,7 +51,7 @@ from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of
-from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.study import Asked, MechanismSettings
@@ -93,27 +93,6 @@ def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
     assert np.allclose(*controls, atol=1e-5)  # the same clip and question
     assert not np.allclose(states.read("chaotic", 3), states.read("chaotic_ill_posed", 3), atol=1e-3)
     assert len(ill_posed) == 2 * PAIRS and states.n_layers == 5
-
-
-def test_two_items_with_the_same_clip_and_question_have_the_same_states(own: Workspace) -> None:
-    items = own.tables.read(ITEMS, {"dataset": "chaotic"}).to_dict("records")
-    first, twin = (next(r for r in items if r["item_id"] == f"chaotic:plinko-{n}:void") for n in (0, 1))
-    twin |= {name: first[name] for name in ("clip", "media_digest", "question")}
-    own.tables.write(ITEMS, {"dataset": "chaotic"}, [ItemRow(**item) for item in items], {})
-    extract_all(own)
-    states = StoredStates.of(own, STANDARD)
-    at = dict(zip(states.dataset("chaotic")["item_id"], states.read("chaotic", 3), strict=True))
-    assert (at[first["item_id"]] == at[twin["item_id"]]).all()
-    assert (at[first["item_id"]] != at["chaotic:plinko-2:void"]).any()
-    assert set(states.dataset("chaotic")["device"]) == {"cpu"}
-
-
-def test_states_that_are_gone_are_told(own: Workspace) -> None:
-    shutil.rmtree(own.root / "states" / "tiny" / "standard" / "chaotic")
-    with pytest.raises(TrapsError, match="hidden states are missing or not finished; materialize hidden_states"):
-        stages.direction_rows(own, STANDARD)
-    with pytest.raises(TrapsError, match="no hidden states of tiny__guided"):
-        stages.direction_rows(own, Extraction("tiny", "guided"))
 
 
 @pytest.mark.parametrize("lost", ["shard-00000.safetensors", "shard-00000.parquet", "ids.parquet"])
@@ -331,19 +310,6 @@ def test_no_answer_is_steered_along_a_direction_that_comes_from_its_scenario(ste
     of = stages.saved_directions(steered, STANDARD)
     assert of["chaotic"].scenarios & {*steered.tables.read_all(STEERING)["scenario_id"]}
     assert not [1 for row in answers.to_dict("records") if row["scenario_id"] in of[row["source"]].scenarios]
-
-
-def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntry) -> None:
-    answers = steered.tables.read_all(STEERING)
-    controls = answers.query("side == 'control' and source == 'chaotic' and layer == 2")
-    assert controls.groupby(["scenario_id", "kind", "draw", "alpha"])["request_key"].nunique().max() == 1
-    plain = answers.query(f"kind == '{UNSTEERED}'")
-    assert plain.groupby(["dataset", "item_id"]).size().max() == 1 and set(plain["alpha"]) == {0}
-    ledger = steered.answers.read("tiny__guided__steered").rows
-    assert len(ledger) == answers["request_key"].nunique()
-    again = [SteeringCell.make(d, "tiny", "standard", "guided") for d in DATASETS]
-    along = {"standard": stages.saved_directions(steered, STANDARD)}
-    assert sum(made.tally.asked for _, made in collect_steered(steered, entry, again, along)) == 0
 
 
 def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, entry: ModelEntry) -> None:

@@ -21,7 +21,7 @@ from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 
-pytestmark = pytest.mark.promise  # every provider's answers and errors
+pytestmark = pytest.mark.slow  # asks a server
 FINISHES = {"openai/m": "stop", "gemini/gemini-2.5-pro": "STOP", "openai/responses/m": "completed"}
 ROUTES = {"openai/m": "/v1", "gemini/gemini-2.5-pro": "/v1beta", "openai/responses/m": "/v1"}
 QUESTION = "Does the ball clear the barrier?"
@@ -47,6 +47,7 @@ def ask(provider: Provider, route: str, **params: Any) -> Outcome:
     return asyncio.run(asking.ask(Request("m", route, sent, "You watch a clip.", QUESTION, {"item_id": "x"})))
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("route", ROUTES)
 def test_an_answer_is_read_with_what_it_took(provider: Provider, route: str) -> None:
     thinking: dict[str, dict[str, Any]] = {
@@ -91,16 +92,14 @@ def test_no_connection_that_the_client_library_made_at_its_import_is_used(provid
     assert int(tokens) > 0 and float(dollars) > 0, "the answer was not seen on the wire"
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [
         ("rate_limited", "rate_limited"),
-        ("rate_limited_bare", "rate_limited"),
         ("server_error", "server_error"),
-        ("overloaded", "server_error"),
         ("timeout_status", "timeout"),
-        ("conflict", "conflict"),
         ("hang", "timeout"),
         ("cut", None),
         ("wrong_content_type", None),
@@ -116,10 +115,11 @@ def test_what_may_pass_is_worth_another_try(provider: Provider, route: str, faul
     assert provider.stats()["requests"] == 1  # no layer below retries
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize(
     ("fault", "error"),
-    [("bad_request", "http_400"), ("unauthorized", "http_401"), ("forbidden", "http_403"), ("not_found", "http_404")],
+    [("bad_request", "http_400"), ("unauthorized", "http_401")],
 )
 def test_what_will_not_pass_is_final_and_told_once_without_the_key(
     provider: Provider, route: str, fault: str, error: str, capsys: pytest.CaptureFixture[str]
@@ -132,6 +132,7 @@ def test_what_will_not_pass_is_final_and_told_once_without_the_key(
     assert told.startswith("m: ") and f"({error}: " in told and SECRET not in told
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize(
     ("fault", "kind"),
@@ -145,6 +146,7 @@ def test_an_answer_without_its_end_has_a_kind_of_its_own(provider: Provider, rou
     assert outcome.cost_usd is not None and outcome.cost_usd > 0  # it was paid for
 
 
+@pytest.mark.promise
 def test_a_refusal_in_words_is_no_answer(provider: Provider) -> None:
     provider.configure(faults={"refusal": 1.0})
     for route in ROUTES:
@@ -154,7 +156,6 @@ def test_a_refusal_in_words_is_no_answer(provider: Provider) -> None:
     assert ask(provider, "openai/m").kind == "refused"
 
 
-@pytest.mark.slow  # litellm is imported anew
 def test_a_env_file_above_the_checkout_sets_no_proxy_and_no_key(tmp_path: Path) -> None:
     """litellm takes variables from such a file by itself, so that anybody who can write one could read the calls."""
     (tmp_path / ".env").write_text("HTTPS_PROXY=http://127.0.0.1:9\nOPENAI_API_KEY=sk-foreign\nTRAPS_PLANTED=yes\n")

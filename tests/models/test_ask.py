@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
@@ -18,8 +17,6 @@ import pytest
 from tests.build.errors import raises
 from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.database import sentence
-from traps_pipeline.ledger.sqlite import SqliteDatabase
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import STOPS, Call, Settled, Work, run_work, settle
@@ -104,23 +101,6 @@ def test_only_the_difference_is_asked(tmp_path: Path) -> None:
     assert [row["key"] for row in finished["rows"]] == [wanted.key for wanted in ten(CELL)]
 
 
-def test_the_calls_of_a_cell_are_made_once_and_handed_on_with_their_rows(tmp_path: Path) -> None:
-    asked: list[Cell] = []
-    cells = [CELL, Cell("chaotic", CELL.evaluation)]
-
-    def wanted(cell: Cell) -> list[Request]:
-        asked.append(cell)
-        return [request(f"{cell.dataset}-{n}") for n in range(3)]
-
-    def finish(settled: Settled[Cell, Call]) -> dict[str, Any]:
-        return {str(call.request.about["item_id"]): row["key"] for call, row in settled.answered()}
-
-    of_items = replace(work(tmp_path, {"m": Answering()}, wanted), finish=finish)
-    found = {item: key for of_cell in run_work(of_items, cells) for item, key in of_cell.items()}
-    assert sorted(asked) == sorted(cells)
-    assert found == {f"item-{c.dataset}-{n}": request(f"{c.dataset}-{n}").key for c in cells for n in range(3)}
-
-
 def test_a_passing_failure_is_tried_again_and_leaves_no_trace_but_the_count(tmp_path: Path) -> None:
     async def twice_busy(_: Request, call: int) -> Outcome:
         if call <= 2:
@@ -187,19 +167,6 @@ def test_waits_grow_with_each_retry_and_are_drawn_below_their_bound(
     assert bounds == [1, 2, 4, 8, 16, 32, 60, 60]
 
 
-def test_never_more_calls_at_once_than_the_model_allows(tmp_path: Path) -> None:
-    async def slow(_: Request, call: int) -> Outcome:
-        await asyncio.sleep(0.002)
-        return LEFT
-
-    backend = Answering(slow)
-    evaluations = [Evaluation("m", "standard", run) for run in (1, 2)]
-    cells = [Cell(dataset, e) for e in evaluations for dataset in ("occlusion", "chaotic")]
-    done = list(run_work(work(tmp_path, {"m": backend}, ten, Limits(concurrency=3)), cells))
-    assert len(done) == 4
-    assert backend.most_at_once == 3
-
-
 def test_a_model_that_fails_does_not_stop_another(tmp_path: Path) -> None:
     async def broken(_: Request, call: int) -> Outcome:
         raise ValueError("no such parameter: temprature")
@@ -256,26 +223,6 @@ def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_pa
     assert len(local(tmp_path).read(CELL.evaluation.key).rows) == 3
 
 
-def test_a_full_disk_ends_the_cell_and_keeps_what_was_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = SqliteDatabase.run
-
-    def full(database: SqliteDatabase, do: Any) -> Any:
-        """Let SQLite find the disk full once five answers are stored."""
-        if database.exists() and len(local(tmp_path).read(CELL.evaluation.key).rows) >= 5:
-            full_disk = sqlite3.OperationalError("database or disk is full")
-            raise sentence(full_disk, database.place) from full_disk
-        return real(database, do)
-
-    monkeypatch.setattr(SqliteDatabase, "run", full)
-    with raises(TrapsError, "models.ask._raise_together"):
-        list(run_work(work(tmp_path, {"m": Answering()}, ten), [CELL]))
-    kept = len(local(tmp_path).read(CELL.evaluation.key).rows)
-    monkeypatch.undo()
-    (finished,) = run_work(work(tmp_path, {"m": Answering()}, ten), [CELL])
-    assert kept >= 5
-    assert (finished["tally"].cached, finished["tally"].asked) == (kept, 10 - kept)
-
-
 def test_stopping_records_the_calls_in_flight_and_starts_no_new_one(tmp_path: Path) -> None:
     stop = asyncio.Event()
 
@@ -311,19 +258,6 @@ def test_stopping_does_not_wait_for_a_provider_that_asked_for_an_hour(tmp_path: 
     assert len(backend.calls) == 4
 
 
-def test_a_lock_that_is_removed_under_a_run_ends_its_calls_and_keeps_what_was_answered(tmp_path: Path) -> None:
-    lock = tmp_path / "locks" / f"answers-{CELL.evaluation.key}.lock"
-
-    async def removing(_: Request, call: int) -> Outcome:
-        lock.unlink(missing_ok=True)
-        return LEFT
-
-    backend = Answering(removing)
-    with raises(TrapsError, "models.ask._raise_together"):
-        list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
-    assert len(backend.calls) == len(local(tmp_path).read(CELL.evaluation.key).rows) == 4  # at once
-
-
 INTERRUPTED = """
 import asyncio, sys
 from pathlib import Path
@@ -333,6 +267,7 @@ from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
 from tests.build.ledger import local
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 class Slow:
@@ -402,22 +337,6 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     assert run.returncode == 130, err
     assert "Traceback" not in err
     assert len(local(tmp_path).read(CELL.evaluation.key).rows) == 4
-
-
-def test_two_runs_that_want_the_same_keys_at_once_ask_each_once(tmp_path: Path) -> None:
-    script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.02)").replace(
-        "except KeyboardInterrupt", "finally"
-    )
-    script = script.replace("    sys.exit(130)\n", "")
-    runs = [
-        subprocess.Popen(
-            [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
-    said = [run.communicate(timeout=180)[0].splitlines()[-1] for run in runs]
-    assert [run.returncode for run in runs] == [0, 0]
-    assert sorted(said) == ["0 asked", "40 asked"]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import datetime
 import random
-import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from tests.build.calls import entry_of
 from tests.build.ledger import budget as budget_of
-from tests.build.ledger import budget_in, local, paid
+from tests.build.ledger import budget_in, local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import Money, Releasable
 from traps_pipeline.models.ask import Call, Work, run_work
@@ -35,15 +35,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def entry(prices: Prices | None) -> Entry:
-    fields = {
-        "id": "m",
-        "backend": "api",
-        "account": "a",
-        "provider_id": "openai/m",
-        "params": {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000},
-        "prices": prices,
-    }
-    return Entry.model_validate(fields, context={"accounts": {"a": Account()}})
+    return entry_of("m").model_copy(update={"prices": prices})
 
 
 PRICED = entry(Prices(input=2.0, output=10.0, as_of=datetime.date(2026, 11, 1)))
@@ -160,42 +152,6 @@ def test_a_call_that_may_be_billed_counts_as_its_worst_case(
     assert (row and row["outcome"]) == outcome
     assert (row and row["cost_usd"]) == (None if cost_usd is None else pytest.approx(cost_usd))
     assert sum(its.dollars for its in local(tmp_path).totals().values()) <= cap_usd
-
-
-def test_two_runs_spend_from_one_budget_at_the_same_time(tmp_path: Path) -> None:
-    workspace = Workspace.create(tmp_path, Study(budget_usd=5))
-    with spending(workspace, [PRICED]) as one, spending(Workspace.open(tmp_path), [PRICED]) as two:
-        first = asyncio.run(one.reserve("m", 3.0))
-        waiting = asyncio.run(_is_waiting(two, 3.0))
-        asyncio.run(one.settle(first, 0.0))
-        assert waiting and asyncio.run(two.reserve("m", 3.0)) is not None
-
-
-async def _is_waiting(budget: Budget, dollars: float) -> bool:
-    try:
-        await asyncio.wait_for(budget.reserve("m", dollars), 1.5)
-    except TimeoutError:
-        return True
-    return False
-
-
-def test_calls_in_flight_at_a_kill_are_spent_for_good(tmp_path: Path) -> None:
-    workspace = Workspace.create(tmp_path / "study", Study(budget_usd=5))
-
-    async def three_calls(budget: Budget) -> None:
-        first, second, _ = [await budget.reserve("m", 0.5) for _ in range(3)]
-        await budget.settle(first, 0.25)
-        await budget.settle(second, 0.125)
-        assert first is not None
-        async with workspace.answers.writing("m", print) as writer:
-            await writer.write(paid("k", 0.25), {}, [first.id])
-
-    with spending(workspace, [PRICED]) as budget:
-        asyncio.run(three_calls(budget))
-        shutil.copytree(workspace.root, tmp_path / "killed")  # in flight: $0.50; answered and not in the ledger: $0.125
-    for _ in range(2):
-        with spending(Workspace.open(tmp_path / "killed"), [PRICED]) as after:
-            assert after.spent_usd == pytest.approx(0.875)
 
 
 def test_a_cap_for_nobody_is_refused(tmp_path: Path) -> None:

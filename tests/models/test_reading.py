@@ -72,12 +72,6 @@ def test_thoughts_between_tags_are_split_off_where_the_entry_declares_them() -> 
     assert read("<think>I cannot tell</think>", thinks=True).outcome == "empty"
 
 
-def test_undeclared_thoughts_are_never_judged_as_the_answer() -> None:
-    found = read("<think>I cannot tell, so perhaps left.</think> left")
-    assert (found.outcome, found.text) == ("degenerate", None)
-    assert found.why is not None and 'say `thinking: "<think>"`' in found.why
-
-
 @pytest.mark.parametrize(
     ("text", "is_json"),
     [

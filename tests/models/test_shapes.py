@@ -42,67 +42,40 @@ def message(**changes: Any) -> str:
 
 # Not one of these is an answer whose usage can be believed.
 ODD = {
-    "negative-prompt": usage(prompt_tokens=-40_000_000),
     "negative-completion": usage(completion_tokens=-1),
-    "negative-total": usage(total_tokens=-1),
     "null-prompt": usage(prompt_tokens=None),
-    "null-completion": usage(completion_tokens=None),
     "fraction": usage(completion_tokens=2.5),
-    "whole-fraction": usage(completion_tokens=21.0),
     "text-count": usage(completion_tokens="21"),
     "true-count": usage(completion_tokens=True),
-    "list-count": usage(completion_tokens=[21]),
-    "huge-prompt": usage(prompt_tokens=2**63, total_tokens=2**63 + 21),
     "huge-completion": usage(completion_tokens=2**63, total_tokens=2**63 + 20),
-    "float-overflow": usage(completion_tokens=1e308),
     "infinity": usage(completion_tokens=float("inf")),
-    "nan": usage(completion_tokens=float("nan")),
-    "zero-prompt": usage(prompt_tokens=0, total_tokens=21),
     "zero-completion": usage(completion_tokens=0, total_tokens=20),
     "less-than-the-text": usage(completion_tokens=2, total_tokens=22),
-    "less-than-the-prompt": usage(prompt_tokens=1, total_tokens=22),
     "sum-below-parts": usage(total_tokens=5),
-    "sum-of-text": usage(total_tokens="41"),
     "absent-completion": body(usage={"prompt_tokens": 20}),
-    "absent-prompt": body(usage={"completion_tokens": 21}),
     "no-usage": json.dumps({name: value for name, value in BODY.items() if name != "usage"}),
     "null-usage": body(usage=None),
-    "empty-usage": body(usage={}),
     "list-usage": body(usage=[20, 21]),
-    "text-usage": body(usage="41"),
-    "usage-in-usage": body(usage={"usage": USAGE}),
     "no-choices": body(choices=[]),
     "null-choices": body(choices=None),
-    "absent-choices": json.dumps({name: value for name, value in BODY.items() if name != "choices"}),
-    "choices-of-text": body(choices="left"),
     "choices-object": body(choices={"0": CHOICE}),
     "choice-null": body(choices=[None]),
-    "choice-text": body(choices=["left"]),
     "choice-without-message": body(choices=[{"index": 0, "finish_reason": "stop"}]),
     "message-null": body(choices=[CHOICE | {"message": None}]),
-    "message-text": body(choices=[CHOICE | {"message": "left"}]),
     "content-number": message(content=5),
     "content-list": message(content=["left"]),
-    "content-object": message(content={"text": "left"}),
-    "content-true": message(content=True),
-    "body-null": "null",
     "body-list": f"[{body()}]",
-    "body-text": '"left"',
-    "body-number": "12",
     "body-empty": "",
-    "body-blank": " \n ",
     "cut": body()[:90],
     "two-bodies": body() + body(),
     "event-stream": f"data: {body()}\n\ndata: [DONE]\n\n",
     "page": "<!doctype html><h1>It works</h1>",
     "no-utf8": "\udcff\udcfe" + body(),
-    "byte-order-mark": "\ufeff\ufeff" + body(),
     "deep": "[" * 100_000,
     "many-digits": usage(completion_tokens=21).replace("21", "9" * 5000),
     "given-up-in-200": json.dumps({"error": {"message": "upstream took too long", "code": 504}}),
     "error-in-choice": body(choices=[CHOICE | {"error": {"message": "upstream failed", "code": 502}}]),
     "cost-by-name": body(usage={"cost_usd": -1000}),
-    "model-and-no-usage": body(model=5, usage=None),
 }
 STATUSES = {f"status-{status}": status for status in (500, 502, 504, 520, 522, 524, 599, 408, 302, 307, 204)}
 UNBILLED = {f"status-{status}": status for status in (400, 401, 403, 404, 409, 422, 429, 503)}
@@ -223,11 +196,10 @@ def test_a_usage_that_contradicts_itself_is_booked_at_its_largest_and_said(
     assert "(usage: contradicts itself; " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("finish", ["error", "abort", "insufficient_system_resource"])
-def test_half_an_answer_is_asked_again_and_costs_what_its_usage_says(odd: Provider, finish: str) -> None:
-    odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": finish}])}})
+def test_half_an_answer_is_asked_again_and_costs_what_its_usage_says(odd: Provider) -> None:
+    odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": "abort"}])}})
     outcome, booked_usd = booked_for(odd, "m")
-    assert outcome and (outcome.kind, outcome.error, outcome.text) == ("error", f"ended_{finish}", None)
+    assert outcome and (outcome.kind, outcome.error, outcome.text) == ("error", "ended_abort", None)
     assert odd.stats()["requests"] == 2
     assert booked_usd == outcome.cost_usd == pytest.approx(2 * (20e-6 + 21e-5))
 
@@ -237,13 +209,6 @@ def test_an_unknown_finish_reason_is_kept_with_its_text_and_is_no_answer(odd: Pr
     outcome, _ = booked_for(odd, "m")
     assert outcome and (outcome.kind, outcome.finish_reason) == ("unfinished", "of_the_weather")
     assert (outcome.text, outcome.cost_usd) == (ANSWER, pytest.approx(20e-6 + 21e-5))
-
-
-def test_content_in_parts_is_an_answer_and_its_trace(odd: Provider) -> None:
-    thought = {"type": "thinking", "thinking": [{"type": "text", "text": "maybe right"}]}
-    odd.configure(raw_by_model={"m": {"content": message(content=[thought, {"type": "text", "text": ANSWER}])}})
-    outcome, _ = booked_for(odd, "m")
-    assert outcome and (outcome.kind, outcome.text, outcome.reasoning) == ("answer", ANSWER, "maybe right")
 
 
 def test_what_is_odd_beside_the_usage_is_typed_and_stored(odd: Provider, tmp_path: Path) -> None:
@@ -286,10 +251,9 @@ def test_three_answers_out_of_order_in_a_row_stop_a_model_and_are_kept_aside(odd
     assert SECRET not in "".join(path.read_bytes().decode("latin-1") for path in tmp_path.rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize("connections", [1, 200])
-def test_the_cap_holds_against_fuzzed_answers(odd: Provider, tmp_path: Path, connections: int) -> None:
+def test_the_cap_holds_against_fuzzed_answers(odd: Provider) -> None:
     odd.configure(raw_by_model={}, fuzzed=True)
-    calls = 1000 if os.environ.get("TRAPS_MANY_CALLS") else 2 * connections + 50
+    connections, calls = 200, 1000 if os.environ.get("TRAPS_MANY_CALLS") else 450
     entry = entry_of("m", concurrency=connections)
     entry = entry.model_copy(update={"params": PARAMS | {"max_tokens": 500}})
     participant = participants(odd, entry, 100.0)["m"]

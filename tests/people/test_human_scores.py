@@ -108,15 +108,6 @@ def test_the_formula_solves_for_the_true_share() -> None:
     assert np.isnan(rogan_gladen(np.array([0.5]), np.array([0.4]), np.array([0.6]))).all()
 
 
-def test_where_all_answers_are_labelled_the_corrected_share_is_the_true_one(rows: Rows) -> None:
-    verdicts, truth = judged_study(rows, 40, seed=3)
-    one = verdicts["dataset"] == "chaotic"
-    verdicts, truth = verdicts.loc[one].reset_index(drop=True), truth.loc[one].reset_index(drop=True)
-    table = corrected(labels_of(verdicts, truth), verdicts, resamples=50).set_index("dataset")
-    assert table.loc["chaotic", "acc_corrected"] == pytest.approx(truth["right"].mean(), abs=1e-12)
-    assert table.loc["chaotic", "acc"] == pytest.approx(verdicts["correct"].dropna().astype(float).mean())
-
-
 def test_judged_and_corrected_equal_another_implementation(rows: Rows) -> None:
     """Scikit-learn's weighted confusion matrix, and a system of
     linear equations for each share."""

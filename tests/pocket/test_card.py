@@ -13,7 +13,6 @@ from tools.pocket.commands import CARD, EVALUATION, FACTS, MARKS, MECHANISM_FIGU
 from tools.pocket.evaluate import MODEL, markdown, read_cells
 from tools.pocket.planted import planted
 from tools.pocket.recipe import load_recipe
-from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.control_rows import GATE, PATCHING, STEERING_NULLS
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBES, STEERING_SHARES
@@ -37,41 +36,6 @@ def test_the_card_shows_the_shipped_counts() -> None:
         (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
     }
     assert {cell.n for cell in cells} == {recipe.held_out}
-
-
-def test_the_card_says_which_of_the_named_families_it_reads_and_which_not() -> None:
-    """It reads a family if under every regime the lower bound of Acc is 30 points above the commonest answer."""
-    controls = [cell for cell in read_cells(EVALUATION) if cell.kind == "control"]
-    above: dict[str, float] = {}
-    for cell in controls:
-        margin = cell.accuracy_low - cell.prior / cell.n
-        above[cell.family] = min(above.get(cell.family, 1.0), margin)
-    read = {family for family, margin in above.items() if margin >= 0.3}
-    assert read == {"drop_split", "ramp_deflect"}
-    assert {family for family, margin in above.items() if margin <= 0} == set(above) - read
-    assert {(cell.seed, cell.family, cell.regime) for cell in controls if cell.abstained} == {
-        (2, "plinko", "guided"),
-        (3, "plinko", "guided"),
-    }
-    assert all(cell.correct <= cell.prior for cell in controls if cell.family == "plinko")
-    card = " ".join(CARD.read_text().split())
-    assert "Every seed reads both occlusion families, and none reads plinko" in card
-    assert "On seesaw_sorter only seed 2 is above `prior`" in card
-    assert "three training seeds" in card.replace("**", "") and {cell.seed for cell in controls} == {1, 2, 3}
-
-
-def test_the_card_says_of_every_seed_whether_the_time_stamps_have_the_effect_that_was_wanted() -> None:
-    """At most .1 in size was wanted: two seeds have it, and the one that ships has not."""
-    found = {
-        figure.seed: figure.value
-        for figure in inside.read_figures(MECHANISM_FIGURES)
-        if (figure.figure, figure.kind) == ("planted", "stamps")
-    }
-    assert {seed for seed, effect in found.items() if abs(effect) <= 0.1} == {2, 3} == found.keys() - {1}
-    card = " ".join(CARD.read_text().split())
-    assert "carry -.02 and .03 in seeds 2 and 3" in card and "-.26 in the shipped seed" in card
-    assert "with an interval from -.63 to .37: undecided" in card
-    assert [round(found[seed], 2) for seed in (1, 2, 3)] == [-0.26, -0.02, 0.03]
 
 
 # --- what was found inside, over seeds --------------------------------------------------------------------------------
@@ -117,16 +81,6 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
     assert "| Cross-domain | 0.900 (0.800-1.000) | 2 | 0.800 (0.700-0.900) | 1 |" in lines
     assert "| voids, void directions | 75.0 (75.0-75.0) | 37.5 (25.0-50.0) | 15.0-70.0 | 28 | 10 |" in lines
     assert lines[-1] == "Training seeds: 1, 2."
-
-
-def test_figures_of_weights_that_lie_there_no_more_are_refused(tmp_path: Path) -> None:
-    workspace = examined_study(tmp_path, 3, 1.0, 0.5)
-    (tmp_path / "seed3" / FACTS).unlink()
-    with pytest.raises(TrapsError, match="does not name the seed"):
-        inside.figures_of(workspace)
-    (tmp_path / "seed3" / WEIGHTS / "model.safetensors").write_bytes(b"others")
-    with pytest.raises(TrapsError, match="that folder now has other weights or none"):
-        inside.figures_of(workspace)
 
 
 def test_what_was_planted_is_read_from_the_tables_of_the_controls(tmp_path: Path) -> None:

@@ -18,16 +18,14 @@ from tools.pocket.data import (
     SceneRecord,
     ShardJob,
     draw_shard,
-    params_digest,
     released_digests,
     shard_jobs,
 )
-from tools.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
+from tools.pocket.evaluate import markdown, read_cells
 from tools.pocket.recipe import POCKET, Recipe, load_recipe
 from tools.pocket.words import PROMPTS, say
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judged_answers import normalise
 from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
@@ -89,12 +87,6 @@ def test_a_released_scene_is_never_trained_on(recipe: Recipe, data: Path, tmp_pa
     assert drawn[0].params_digest not in {scene.params_digest for scene in _records(banned)}
 
 
-def test_the_digest_of_a_released_scene_is_that_of_its_parameters() -> None:
-    spec = load_released()["drop_split-0001"]
-    assert params_digest(spec.family, spec.params) in released_digests()
-    assert params_digest(spec.family, spec.params | {"ridge_m": 0.4001}) not in released_digests()
-
-
 def test_frames_for_training_are_those_that_a_clip_gives(
     recipe: Recipe, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,14 +104,6 @@ def test_frames_for_training_are_those_that_a_clip_gives(
         assert shown.times_s.tolist() == pytest.approx(Scenes(recipe, data).times(0, side))
         off = np.abs(shown.frames.astype(int) - rendered[0, side])
         assert off.mean() < 3 and (off > 40).mean() < 0.005  # of 255: colours are halved in resolution
-
-
-def test_voids_alone_are_labelled_with_abstentions(recipe: Recipe, data: Path) -> None:
-    (job,) = shard_jobs(recipe, "train", data)
-    for scene in _records(job):
-        assert scene.asked.answer in scene.labels and scene.answerable.answer is not None
-        assert scene.asked.label(_guided(recipe)) == scene.asked.answer
-        assert scene.visual.label(_guided(recipe)) in (None, *scene.labels)
 
 
 def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -> None:
@@ -201,33 +185,6 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_part_of_a_clip_is_the_clip_with_the_rest_hidden(recipe: Recipe, data: Path) -> None:
-    """The same loss as of the whole clip where the attention mask hides all other pairs of frames from every token."""
-    import torch
-
-    from tools.pocket.batches import Batches, Look, Scenes
-    from tools.pocket.model import make_model, train_tokenizer
-    from tools.pocket.train import answer_loss, look_at
-
-    scenes = Scenes(recipe, data)
-    model, processor = make_model(train_tokenizer(scenes.records), seed=1)
-    model.eval()
-    batches, asked = Batches(scenes, model, processor, recipe.training, 1), (scenes.records[0].asked,)
-    whole = batches.make([Look(0, 0, asked)], "standard", np.array(scenes.frames(0, 0))[None])
-    part = batches.make([Look(0, 0, asked, (1, 2))], "standard", np.array(scenes.frames(0, 0, (1, 2)))[None])
-    first = whole.ids[0].tolist().index(processor.vision_start_token_id)  # of the chat; each pair has one of its own
-    pair = (whole.ids.shape[1] - part.ids.shape[1]) // 2
-    gone = [*range(first + 1, first + 1 + pair), *range(first + 1 + 3 * pair, first + 1 + 4 * pair)]
-    left = [i for i in range(whole.ids.shape[1]) if i not in gone]
-    assert (whole.ids[:, left] == part.ids).all()
-    length = len(whole.head)
-    assert (whole.positions[:, :, [*range(length), *(length + i for i in left)]] == part.positions).all()
-    whole.sees[..., [length + i for i in gone]] = False
-    with torch.no_grad():
-        losses = [answer_loss(model, look_at(model, batch), batch).item() for batch in (whole, part)]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-
-
 def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Path, tmp_path: Path) -> None:
     from tools.pocket.train import train
 
@@ -238,27 +195,6 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Pat
     assert (whole / "model.safetensors").read_bytes() == (resumed / "model.safetensors").read_bytes()
     with pytest.raises(TrapsError, match="belongs to another recipe, data or seed"):
         train(recipe, data, tmp_path / "stopped", 2)
-
-
-def test_training_interrupted_inside_a_step_goes_on_from_the_step_before(
-    recipe: Recipe, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import torch
-
-    from tools.pocket.train import train
-
-    train(recipe, data, tmp_path, 1, stop_after=1)
-    kept = (tmp_path / "state.safetensors").read_bytes()
-
-    def half_a_step(self: torch.optim.AdamW, *_: object) -> None:
-        with torch.no_grad():
-            self.param_groups[0]["params"][0].add_(1.0)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(torch.optim.AdamW, "step", half_a_step)
-    with pytest.raises(KeyboardInterrupt):
-        train(recipe, data, tmp_path, 1, stop_after=2)
-    assert (tmp_path / "state.safetensors").read_bytes() == kept
 
 
 # --- what ships -------------------------------------------------------------------------------------------------------
@@ -275,20 +211,6 @@ def test_the_shipped_weights_are_small_and_are_those_of_the_facts() -> None:
     assert file_digest(weights) == facts["weights"]
     assert facts["recipe"] == digest(load_recipe().content()) and facts["seed"] == 1
     assert f"`{facts['data']}`" in CARD.read_text()
-
-
-def test_it_reads_a_held_out_clip_through_the_adapter(recipe: Recipe, data: Path, tmp_path: Path) -> None:
-    from tools.pocket.evaluate import held_out
-
-    entry = entry_of(POCKET / WEIGHTS)
-    assert entry.id == MODEL and entry.media == recipe.media
-    asked: list[Asked] = list(held_out(recipe, data))
-    assert [one.kind for one in asked] == ["control", "visual", "ill_posed", "answerable"]
-    cells = evaluate(entry, asked, 1)
-    assert sum(cell.n for cell in cells) == 12 and all(cell.prior == 1 for cell in cells if cell.kind == "control")
-    write_cells(tmp_path / "cells.csv", cells)
-    write_cells(tmp_path / "cells.csv", cells)  # the same seed again takes its own place
-    assert read_cells(tmp_path / "cells.csv") == cells
 
 
 def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tools.pocket.batches import NAMED, Scenes, names_of
+from tools.pocket.batches import Scenes
 from tools.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
 from tools.pocket.recipe import Jitter, Recipe, load_recipe
 from tools.pocket.words import PROMPTS
@@ -101,40 +101,6 @@ def test_a_panel_closes_controls_and_held_voids_alike(
     assert all(seen.values())
 
 
-def test_the_pair_of_frames_that_is_always_shown_is_the_last_before_the_panel_and_tells_no_side(
-    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
-) -> None:
-    made, folder, _ = planted
-    scenes, rng = Scenes(made, folder), np.random.default_rng(0)
-    for number, record in enumerate(scenes.records):
-        closes_s = (record.closes_frame or record.n_frames) / FPS - record.control_from / FPS
-        before = [i for i, time in enumerate(scenes.times(number, 0)) if time < closes_s - 1e-6]
-        assert scenes.pairs(number, 0, 1, rng) == (before[-1] // 2,)
-        assert scenes.pairs(number, 0, 4, rng) is scenes.pairs(number, 0, None, rng) is None
-        two = scenes.pairs(number, 0, 2, rng)
-        assert two is not None and before[-1] // 2 in two and two[0] < two[1] <= 3
-        assert (
-            scenes.frames(number, 0, two) == scenes.frames(number, 0)[[2 * p + i for p in two for i in (0, 1)]]
-        ).all()
-        assert (
-            scenes.names(number, 0, two) == scenes.names(number, 0).reshape(4, 48, -1)[[*two]].reshape(96, -1)
-        ).all()
-        if record.cut_frame is None:
-            assert scenes.pairs(number, 1, 1, rng) == (before[-1] // 2,)
-
-
-def test_a_token_is_named_for_what_was_seen_there_before_a_panel_came_between_two_frames() -> None:
-    """Red in the first square of the earlier frame, blue in the second of the later one."""
-    frames = np.full((4, 32, 32, 3), 128, np.uint8)
-    frames[2, :16, :16], frames[3, :16, 16:] = (220, 40, 40), (40, 70, 220)
-    red, blue = NAMED.index("red"), NAMED.index("blue")
-    plain, across = names_of(frames), names_of(frames, 1)
-    assert plain.shape == (8, len(NAMED) + 8 + 6) and not plain[:4, : len(NAMED)].any()
-    assert [*plain[4:6, red]] == [0, 0] and [*across[4:6, red]] == [1, 0]
-    assert [*plain[4:6, blue]] == [*across[4:6, blue]] == [0, 1]
-    assert (across[:4] == plain[:4]).all() and (across[6:] == plain[6:]).all()
-
-
 def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
     made, folder, records = planted
     scenes, rng = Scenes(made, folder), np.random.default_rng(0)
@@ -184,12 +150,3 @@ def test_a_share_for_every_prompt_is_needed() -> None:
     for both in ((0.5, SHARES), (None, None)):
         with pytest.raises(ValidationError, match=r"give abstain_share .* or abstain_shares"):
             Recipe.model_validate(values | dict(zip(("abstain_share", "abstain_shares"), both, strict=True)))
-
-
-def test_settings_that_a_recipe_does_not_have_are_not_in_its_digest() -> None:
-    """A recipe from before they came is the same recipe after."""
-    values = load_recipe().model_dump(exclude={"abstain_share", "abstain_shares", "jitter", "decoys"})
-    assert "abstain_share" in Recipe.model_validate(values | {"abstain_share": 0.5}).content()
-    assert not {"abstain_shares", "jitter", "decoys"} & set(
-        Recipe.model_validate(values | {"abstain_share": 0.5}).content()
-    )

@@ -40,6 +40,7 @@ _MEDIA_TOKENS = 258  # what Gemini counts for a frame
 _LONG = 256  # strings from here on are looked at for base64: shorter ones are no clip
 _MEDIA_KEYS = ("data", "file_data")  # hold base64 however short it is
 _PARENT_LOOK_S = 0.5
+HANG_S = 300.0  # when even the server gives up
 
 
 # --- what goes wrong --------------------------------------------------------------------------------------------------
@@ -94,7 +95,7 @@ class Config:
     `billed`. fuzzed: answers of the chat
     API come with a few of their values, or their end, replaced. usd_a_token: what the server bills for prompt and
     completion; an attempt that its status does not refuse is billed, and one that is odd as the most that it may take.
-    hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
+    served_suffix goes behind the model's name, as real ones answer with a date.
     blind: models that leave images and videos out, as a server of text models may; the others name the colours of a
     clip that they are asked for. served: what the list of models holds, which comes with list_status. unstructured:
     models that refuse what asks for structured output.
@@ -107,7 +108,6 @@ class Config:
     only_first_attempts: int | None = None
     scripts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     retry_after_s: float = 0.05
-    hang_s: float = 300.0
     served_suffix: str = ""
     raw_by_model: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     fuzzed: bool = False
@@ -544,23 +544,6 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 # --- what is kept -----------------------------------------------------------------------------------------------------
 
-_SECRET_NAME = re.compile(r"authorization|api-?_?key|token|secret|^key$", re.IGNORECASE)
-
-
-def fingerprint(secret: str) -> str:
-    """What stands for a key in a record: a test can tell which key came without any being kept."""
-    return "sha256:" + hashlib.sha256(secret.encode()).hexdigest()[:16]
-
-
-def redacted(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Headers or a query with every key reduced to its fingerprint; names in lower case."""
-    return {name.lower(): _without_key(value) if _SECRET_NAME.search(name) else value for name, value in pairs.items()}
-
-
-def _without_key(value: str) -> str:
-    scheme, space, key = value.rpartition(" ")
-    return f"{scheme}{space}{fingerprint(key)}"
-
 
 def without_media(value: Any, key: str = "") -> Any:
     """A body in which digest and size of the decoded bytes stand for base64."""
@@ -609,7 +592,6 @@ class Tallies:
         return {
             "requests": self.requests,
             "billed_usd": self.billed_usd,
-            "distinct_bodies": len(self.attempts),
             "answered_in_full": self.answered_by_fault.total(),
             "by_status": dict(self.by_status),
             "by_fault": dict(self.by_fault),
@@ -671,7 +653,7 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
         return Reply(200, fuzz(body, number), delay_s=config.latency_s, tokens=tokens)
     return json_reply(
         body,
-        delay_s=config.hang_s if fault == "hang" else config.latency_s,
+        delay_s=HANG_S if fault == "hang" else config.latency_s,
         cut=fault in ("cut", "hang"),
         tokens=(question.prompt_tokens, sum(_usage(question, ending)[1:]) + REASONING_TOKENS),
     )
@@ -697,7 +679,7 @@ class Server:
             self._in_flight -= 1
 
     async def _provide(self, request: web.BaseRequest, tallies: Tallies) -> web.StreamResponse:
-        record: Json = {"fault": None, "status": None, "answered_in_full": False}
+        record: Json = {"fault": None, "status": None, "answered_in_full": False, "body": None}
         reply = await self._decide(request, tallies, record)
         tallies.billed_usd += sum(n * usd for n, usd in zip(reply.tokens, self._config.usd_a_token, strict=True))
         await asyncio.sleep(reply.delay_s)
@@ -715,8 +697,6 @@ class Server:
         content = await request.content.read()
         if self._keeps_records:
             tallies.records.append(record)
-            record |= {"method": request.method, "path": request.path}
-            record |= {"query": redacted(request.query), "headers": redacted(request.headers), "body": None}
         if request.method == "GET" and request.path.endswith("/models") and self._config.served is not None:
             listed = {"object": "list", "data": [{"id": name} for name in self._config.served]}
             return json_reply(listed, self._config.list_status)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.build.commitments import committed
-from tests.conftest import Checkout, make_checkout
+from tests.conftest import Checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.release.commitment import (
@@ -104,16 +104,3 @@ def test_a_commitment_is_made_once_and_of_one_draw(copy: Path, tmp_path: Path) -
         commit(copy / "private", tmp_path / "c.json", tmp_path / "r.json")
     with pytest.raises(TrapsError, match="is no commitment"):
         read_commitment(copy / "reveal.json")
-
-
-def test_a_family_without_a_number_is_sampled_with_one(copy: Path, tmp_path: Path) -> None:
-    checkout = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
-    composition = checkout.root / "scene_specs" / "composition.yaml"
-    lines = composition.read_text().splitlines(keepends=True)
-    composition.write_text("".join(line for line in lines if not line.startswith("hidden_drop:")))
-    sample = ("benchmark", "sample", "--seed", "2026", "--families", "hidden_drop", "--out", copy / "private")
-    refused = checkout.traps(*sample)
-    assert refused.code == 1
-    assert "composition.yaml has no number of scenarios for hidden_drop; say --count N" in refused.err
-    made = checkout.traps(*sample, "--count", "1")  # which lies there, and is not drawn again
-    assert made.code == 0 and "1 scenarios of 1 families" in made.out, made.out + made.err

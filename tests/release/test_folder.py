@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from tests.conftest import Checkout
 from tests.release.environments import run_in
@@ -17,7 +16,6 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
 from traps_pipeline.release.folder import Options, identifying, write_release
@@ -76,11 +74,6 @@ def test_every_certificate_of_every_scenario_holds(released: Path) -> None:
     assert {row["scenario_id"] for row in found} == {row["scenario_id"] for row in rows(released / "scenarios.jsonl")}
     assert [row for row in found if not row["holds"] or row["failure"]] == []
     assert all(json.loads(row["evidence"]) for row in found if row["certificate"] == "outcome")
-
-
-def test_prompts_are_those_that_models_are_sent(released: Path) -> None:
-    sent = {row["name"]: row["text"] for row in rows(released / "prompts.jsonl") if row["role"].startswith("system")}
-    assert sent == {regime: system_prompt(regime) for regime in ("standard", "guided", "json")}
 
 
 def test_every_column_of_every_table_is_in_the_dictionary_and_in_the_description(released: Path) -> None:
@@ -164,13 +157,6 @@ def test_a_clip_that_is_not_its_items_is_named_and_nothing_is_written(demo_study
     finished = demo_study.traps("publish", "release", tmp_path / "out")
     assert finished.code == 1 and f"{clip}: is missing or not the clip of its item" in finished.err
     assert not (tmp_path / "out").exists()
-
-
-def test_the_card_begins_with_the_hubs_header(released: Path) -> None:
-    _, header, _ = (released / "README.md").read_text().split("---\n", 2)
-    data = yaml.safe_load(header)
-    assert [config["config_name"] for config in data["configs"]] == ["pairs", "items"]
-    assert data["license"] == ["cc-by-4.0", "cc-by-nc-4.0"]
 
 
 # --- in environments of their own -------------------------------------------------------------------------------------

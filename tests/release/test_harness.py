@@ -1,4 +1,6 @@
-"""The harnesses put the same items, prompts and frames and score to the last digit as a study does; logs come back."""
+"""A harness holds the items, prompts and frames of a study and scores as it does; answers come back by item.
+
+The real programs run it in `test_pocket_harness.py`."""
 
 from __future__ import annotations
 
@@ -12,22 +14,20 @@ from typing import Any
 import pytest
 
 from tests.build.harness import ours
-from tests.conftest import EXPERIMENT, Checkout, forget_rows, once
-from tests.release.environments import run_in
+from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.answer_exchange import Whose, import_answers
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
-from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
+from traps_pipeline.release.harness.scoring import figures, judge
 from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-MODELS = ("oracle", "always-abstain", "observer", "random-50")
 
 
 @pytest.fixture(scope="module")
@@ -125,156 +125,12 @@ def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_pat
         shown("video", 2)
 
 
-# --- the real harnesses, in environments of their own -----------------------------------------------------------------
-
-INSPECT = """
-import json, sys
-from importlib.metadata import version
-from inspect_ai import eval
-from inspect_ai.model import ModelOutput, ModelUsage, get_model
-folder, answers, logs, regime, *models = sys.argv[1:]
-sys.path.insert(0, folder)
-from traps_task import traps
-from traps_harness.harness_items import items
-given, found = json.load(open(answers))[regime], {"version": version("inspect_ai")}
-for model in models:
-    outputs = [ModelOutput.from_content("mockllm/model", given[model][item["item_id"]]) for item in items()]
-    for output in outputs:
-        output.usage = ModelUsage(input_tokens=1, output_tokens=1, total_tokens=2)  # else it loads a tokenizer
-    replay = get_model("mockllm/model", custom_outputs=outputs)
-    (log,) = eval(traps(regime), model=replay, display="none", max_samples=1, log_dir=f"{logs}/{model}",
-                  log_images=False, log_format="json" if model == "oracle" else "eval")
-    assert log.status == "success", str(log.error)[:2000]
-    for sample, item in zip(log.samples, items()):
-        system, user = sample.messages[:2]
-        kinds = [part.type for part in user.content]
-        assert kinds == ["image"] * len(item["media"]) + ["text"], kinds
-        assert (sample.id, user.content[-1].text) == (item["item_id"], item["question"])
-        assert system.role == "system" and system.text.startswith("You are"), system.text[:80]
-    found[model] = {name: one.value for score in log.results.scores for name, one in score.metrics.items()}
-print(json.dumps(found))
-"""
-
-
-@pytest.fixture(scope="module")
-def inspected(harness: Path, answers: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
-    """Figures by model of the real inspect_ai, and the folder of its logs."""
-    logs = tmp_path_factory.mktemp("logs")
-    printed = run_in("inspect", "-c", INSPECT, harness, answers, logs, "standard", *MODELS, INSPECT_DISABLE_TRACE="1")
-    return json.loads(printed.splitlines()[-1]), logs
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_inspect_ai_gives_the_same_figures_to_the_last_digit(
-    inspected: tuple[dict[str, Any], Path], workspace: Workspace, model: str
-) -> None:
-    found = inspected[0][model]
-    assert {name: found[name] for name in found if name not in ("missing", "unread")} == ours(
-        workspace, model, "standard"
-    )
-    assert (found["missing"], found["unread"]) == (0, 0)
-
-
-def test_inspect_ai_finds_the_task_in_its_file(harness: Path) -> None:
-    listed = run_in("inspect", "-m", "inspect_ai", "list", "tasks", "traps_task.py", folder=harness)
-    assert listed.split() == ["traps_task.py@traps"]
-
-
-LMMS = """
-import json, sys
-from importlib.metadata import version
-from lmms_eval import evaluator
-from lmms_eval.api.model import lmms
-from lmms_eval.loggers import EvaluationTracker
-from lmms_eval.tasks import TaskManager
-folder, answers, logs, regime, *models = sys.argv[1:]
-given, found = json.load(open(answers))[regime], {"version": version("lmms_eval")}
-
-class Replay(lmms):
-    is_simple = True
-
-    def __init__(self, name):
-        super().__init__()
-        self.name = name
-
-    def generate_until(self, requests):
-        said = []
-        for context, _, visual, doc_id, task, split in (request.args for request in requests):
-            doc = self.task_dict[task][split][doc_id]
-            assert len(visual(doc)) == len(doc["media"]) and context.endswith("\\n\\n" + doc["question"])
-            said.append(given[self.name][doc["item_id"]])
-        return said
-
-    def loglikelihood(self, requests):
-        raise NotImplementedError
-
-    generate_until_multi_round = loglikelihood
-
-manager = TaskManager(include_path=f"{folder}/lmms", include_defaults=False)
-for model in models:
-    got = evaluator.simple_evaluate(model=Replay(model), tasks=[f"traps_{regime}"], task_manager=manager,
-                                    log_samples=True, bootstrap_iters=0, batch_size=1)
-    tracker = EvaluationTracker(output_path=f"{logs}/{model}")
-    tracker.general_config_tracker.model_name_sanitized = model
-    tracker.date_id = "now"
-    tracker.save_results_samples(task_name=f"traps_{regime}", samples=got["samples"][f"traps_{regime}"])
-    values = got["results"][f"traps_{regime}"]
-    found[model] = {name.removeprefix("traps_").removesuffix(",none"): value for name, value in values.items()
-                    if name.startswith("traps_") and "stderr" not in name}
-print(json.dumps(found))
-"""
-
-
-@pytest.fixture(scope="module")
-def lmms_evaluated(
-    harness: Path, answers: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[dict[str, Any], Path]:
-    """Figures by model of the real lmms-eval, and the folder of its samples."""
-    logs = tmp_path_factory.mktemp("samples")
-    printed = run_in("lmms", "-c", LMMS, harness, answers, logs, "standard", *MODELS, HF_HOME=str(logs / "cache"))
-    return json.loads(printed.splitlines()[-1]), logs
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_lmms_eval_gives_the_same_figures_to_the_last_digit(
-    lmms_evaluated: tuple[dict[str, Any], Path], workspace: Workspace, model: str
-) -> None:
-    expected = ours(workspace, model, "standard")
-    assert lmms_evaluated[0][model] == {name: expected[name] for name in FIGURES} | {"missing": 0, "unread": 0}
-
-
 # --- answers come back ------------------------------------------------------------------------------------------------
 
 
 def imported_texts(workspace: Workspace, model: str, regime: str) -> dict[str, str]:
     rows = workspace.answers.read(f"{model}__{regime}__run1").settled.values()
     return {row["components"]["about"]["item_id"]: row["text"] for row in rows}
-
-
-@pytest.mark.parametrize("model", ["oracle", "random-50"])
-def test_an_inspect_log_is_imported_by_item(
-    inspected: tuple[dict[str, Any], Path], demo_study: Checkout, answers: Path, model: str
-) -> None:
-    """Of oracle the log is JSON, of the other inspect's own format."""
-    (log,) = (inspected[1] / model).iterdir()
-    assert log.suffix == (".json" if model == "oracle" else ".eval")
-    forget_rows(demo_study, "answers", f"{model}__standard__run1")
-    finished = demo_study.traps("study", "import-answers", "demo", log, "--model", model)
-    assert finished.code == 0 and finished.out.startswith("128 answers imported, 0 were there already"), finished.err
-    given = json.loads(answers.read_text())["standard"][model]
-    assert imported_texts(Workspace.open(demo_study.workspace), model, "standard") == given
-
-
-def test_samples_of_lmms_eval_are_imported_by_item(
-    lmms_evaluated: tuple[dict[str, Any], Path], demo_study: Checkout, answers: Path
-) -> None:
-    (samples,) = (lmms_evaluated[1] / "random-50").rglob("*_samples_*.jsonl")
-    forget_rows(demo_study, "answers", "random-50__standard__run1")
-    workspace = Workspace.open(demo_study.workspace)
-    found = import_answers(workspace, load_experiment("demo"), samples, Whose("random-50"))
-    assert (found.new, found.known) == (128, 0)
-    given = json.loads(answers.read_text())["standard"]["random-50"]
-    assert imported_texts(workspace, "random-50", "standard") == given
 
 
 def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(

@@ -9,21 +9,19 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import ROOT, Checkout, make_checkout
+from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
 from traps_pipeline.cluster.ray_runs import require_cluster
-from traps_pipeline.cluster.same_code import code_here, require_same_code
-from traps_pipeline.cluster.shared_history import HISTORY, LOGS
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.spending import spending
 from traps_pipeline.pipeline.run import dagster_history
@@ -161,44 +159,3 @@ def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
             except TrapsError as error:
                 assert "nobody takes runs" in str(error) and process.poll() is None and time.monotonic() < until, error
                 time.sleep(1)
-
-
-def of_another_host(checkout: Checkout) -> Callable[[], str]:
-    """What a host with the code of a checkout says of it."""
-
-    def code() -> str:
-        program = "from traps_pipeline.cluster.same_code import code_here\nprint(code_here())"
-        printed = checkout.run(sys.executable, "-c", program)
-        assert printed.code == 0, printed.err
-        return printed.out.strip()
-
-    return code
-
-
-def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -> None:
-    checkout = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
-    file, code = checkout.root / "traps_pipeline" / "base" / "digests.py", of_another_host(checkout)
-    ours = file.read_text()
-    file.write_text(ours + "# altered on that host\n")
-    remedied(
-        lambda: require_same_code(code(), "lab"), "cluster.same_code.require_same_code", lambda: file.write_text(ours)
-    )
-    assert code() == code_here()
-
-
-def test_a_host_whose_password_is_wrong_opens_the_history_once_it_is_right(
-    address: str, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
-    for exported in (HISTORY, LOGS):
-        monkeypatch.setenv(exported, "")  # and as it was after the test
-    monkeypatch.setenv(RAY, "http://127.0.0.1:1")
-    monkeypatch.delenv("DAGSTER_HOME", raising=False)
-    workspace = Workspace.create(address, Study())
-    monkeypatch.setenv(DATABASE, postgres.address(password="wrong"))
-
-    def runs() -> int:
-        with dagster_history(workspace) as instance:
-            return instance.get_runs_count()
-
-    assert remedied(runs, "pipeline.run.dagster_history", lambda: monkeypatch.setenv(DATABASE, postgres.address())) == 0

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,17 +19,6 @@ def written(path: Path, text: str = "x") -> Callable[[], str]:
         return path.read_text()
 
     return call
-
-
-@contextlib.contextmanager
-def limited(kind: int, soft: int) -> Iterator[Callable[[], None]]:
-    """A limit of this process; what raises it again, as `ulimit` does."""
-    before = resource.getrlimit(kind)
-    resource.setrlimit(kind, (soft, before[1]))
-    try:
-        yield lambda: resource.setrlimit(kind, before)
-    finally:
-        resource.setrlimit(kind, before)
 
 
 @contextlib.contextmanager
@@ -57,27 +44,6 @@ def test_a_full_disk_is_written_to_once_some_space_is_freed(tiny_disk: Path) -> 
     text = "x" * 30_000
     call = written(tiny_disk / "a.txt", text)
     assert remedied(call, "base.files.replacing", filler.unlink) == text
-
-
-def test_a_file_beyond_the_limit_is_written_once_that_is_raised(tmp_path: Path) -> None:
-    with limited(resource.RLIMIT_FSIZE, 1000) as raise_it:
-        call = written(tmp_path / "a.txt", "x" * 2000)
-        assert len(remedied(call, "base.files.replacing", raise_it)) == 2000
-
-
-def test_a_file_is_written_once_this_shell_may_open_more(tmp_path: Path) -> None:
-    held = os.open("/", os.O_RDONLY)
-    with limited(resource.RLIMIT_NOFILE, held) as raise_it:  # descriptors below `held` are taken
-        remedied(written(tmp_path / "a.txt"), "base.files.replacing", raise_it)
-    os.close(held)
-
-
-def test_a_disk_that_is_mounted_for_writing_is_written_to(tiny_disk: Path) -> None:
-    def mount(how: str) -> None:
-        subprocess.run(["mount", "-o", f"remount,{how}", str(tiny_disk)], check=True)
-
-    mount("ro")
-    remedied(written(tiny_disk / "a.txt"), "base.files.replacing", lambda: mount("rw"))
 
 
 def test_a_folder_of_somebody_else_is_written_to_once_this_user_may(tmp_path: Path) -> None:

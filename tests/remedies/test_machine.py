@@ -30,15 +30,12 @@ __all__ = ["nobodys_own"]  # a fixture
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("variable", "value"),
-    [("MUJOCO_GL", "nonsense"), ("GALLIUM_DRIVER", "nonsense"), ("MESA_GL_VERSION_OVERRIDE", "1.0")],
-)
-def test_variables_that_choose_an_opengl_that_does_not_draw_are_named_and_unset(
-    monkeypatch: pytest.MonkeyPatch, variable: str, value: str
+def test_a_variable_that_chooses_an_opengl_that_does_not_draw_is_named_and_unset(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv(variable, value)
-    with pytest.raises(TrapsError, match=f"cannot render clips with .*{variable}={value}"):
+    variable = "GALLIUM_DRIVER"
+    monkeypatch.setenv(variable, "nonsense")
+    with pytest.raises(TrapsError, match=f"cannot render clips with .*{variable}=nonsense"):
         check_rendering()
 
     def unset() -> None:

@@ -10,13 +10,12 @@ import pytest
 from tests.conftest import Checkout
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.release.checksums import CHECKSUMS
-from traps_pipeline.release.content import content_of, pair_rows
+from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.release.submission import pack, read_submission
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
-from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -64,24 +63,6 @@ def test_a_release_is_written_to_an_empty_a_new_or_a_deleted_folder(workspace: W
         lambda: write_release(content, folder, Options(held_out=folder / "key")),
         "release.folder.write_release",  # and the former release is still there
         again=lambda: write_release(content, folder, Options(held_out=tmp_path / "key")),
-    )
-
-
-def test_a_pair_is_released_once_both_sides_are_there_and_an_arm_that_is_left_out_is_not_missed(
-    workspace: Workspace, small: Checkout, tmp_path: Path
-) -> None:
-    remedied(
-        lambda: content_of(workspace, ["decoy"]), "release.content.content_of", again=lambda: content_of(workspace)
-    )
-    root = tmp_path / "study"
-    shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("ledger", "dagster", "reports"))
-    own, partition = Workspace.open(root), {"dataset": "chaotic"}
-    whole = own.tables.read(ITEMS, partition)
-    own.tables.write(ITEMS, partition, whole.iloc[1:], {})
-    remedied(
-        lambda: pair_rows(content_of(own)),
-        "release.content.pair_rows",
-        lambda: own.tables.write(ITEMS, partition, whole, {}),
     )
 
 

@@ -33,11 +33,10 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.local import adapter
-from traps_pipeline.models.local import model as local_model
 from traps_pipeline.models.local.adapter import Sampling, load_local_model
-from traps_pipeline.models.local.checkpoint import folder_digest, weight_bytes
+from traps_pipeline.models.local.checkpoint import weight_bytes
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompt_batches import batches, collate
+from traps_pipeline.models.local.prompt_batches import batches
 from traps_pipeline.models.local.sampling import SeededNucleus
 from traps_pipeline.models.local.settings import MechanismSpec
 from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer
@@ -75,17 +74,6 @@ def test_a_saved_checkpoint_reloads_through_the_auto_classes_and_answers_a_real_
     assert np.abs(seen.raw[-1] - inverted.raw[-1]).max() > 1e-3  # what is in the picture reaches the last token
 
 
-@each_family
-def test_system_prompt_clip_and_question_arrive_whole_and_in_order(family: Family) -> None:
-    of = model(family)
-    prompt = ask(of, QUESTIONS[1])
-    text = of.processor.tokenizer.decode(prompt.inputs["input_ids"][0])
-    clip_at = text.index(of.processor.video_token)
-    assert text.index(SYSTEM) < clip_at < text.index(QUESTIONS[1])
-    bos = of.processor.tokenizer.bos_token
-    assert bos is None or text.count(bos) == 1
-
-
 def test_time_stamps_are_those_of_the_frames() -> None:
     qwen, gemma = model("qwen3-vl"), model("gemma-4")  # LLaVA reads none
     frames = np.zeros((5, 64, 64, 3), np.uint8)
@@ -113,23 +101,8 @@ def test_neither_the_cache_nor_a_batch_nor_padding_changes_an_answer(family: Fam
     assert len(set(together)) > 1
 
 
-@each_family
-def test_states_of_a_padded_prompt_are_those_of_the_prompt_alone(family: Family) -> None:
-    of, prompts = model(family), three_prompts(family)
-    batch = collate(prompts, of.network.generation_config.pad_token_id)
-    assert (batch["attention_mask"][:, 0] == 0).sum() == 2  # padded on the left, all but the longest
-    mask = batch["attention_mask"]
-    with torch.inference_mode():
-        if family != "qwen3-vl":  # which makes its own of the mask, as `generate` does for the others
-            batch["position_ids"] = (mask.cumsum(-1) - 1).clamp(min=0)
-        padded = of.network.base_model(**batch, use_cache=False).last_hidden_state[:, -1].numpy()
-    alone = np.stack([of.forward_states(prompt).normed for prompt in prompts])
-    np.testing.assert_allclose(padded, alone, rtol=0, atol=2e-5)
-
-
-@each_family
-def test_a_sampled_answer_depends_on_its_seed_and_not_on_its_batch(family: Family) -> None:
-    of, prompts = model(family), three_prompts(family)
+def test_a_sampled_answer_depends_on_its_seed_and_not_on_its_batch() -> None:
+    of, prompts = model("gemma-4"), three_prompts("gemma-4")
     sampled = tokens(of.generate(prompts, 10, Sampling(0.8, 0.95, (1, 2, 3))))
     assert sampled[1:] == tokens(of.generate(prompts[1:], 10, Sampling(0.8, 0.95, (2, 3))))
     again = tokens(of.generate([prompts[0]] * 3, 10, Sampling(0.8, 0.95, (1, 1, 2))))
@@ -150,15 +123,6 @@ def test_the_nucleus_is_drawn_from_with_its_own_shares() -> None:
     assert drawn(1.0, 0.6) == within(np.array([0, 2, 0, 1]) / 3, abs=0.025)  # 0.5 alone does not reach 0.6
     assert drawn(1.0, 0.5) == within(np.array([0, 1, 0, 0]))
     assert drawn(0.5, 1.0) == within(probabilities**2 / (probabilities**2).sum(), abs=0.025)
-
-
-def test_rows_of_one_seed_go_through_one_stream() -> None:
-    scores = torch.zeros(3, 1000)
-    sampler = SeededNucleus(Sampling(1.0, 1.0, (7, 7, 8)))
-    steps = [sampler(None, scores).argmax(dim=-1).tolist() for _ in range(5)]
-    assert all(a == b for a, b, _ in steps)
-    assert len({a for a, _, _ in steps}) > 1
-    assert [a for a, _, _ in steps] != [c for _, _, c in steps]
 
 
 def test_prompts_with_other_numbers_of_frames_are_answered_in_order_all_the_same() -> None:
@@ -264,12 +228,6 @@ def test_modules_too_narrow_for_four_bits_on_a_cpu_are_named() -> None:
 # --- checkpoints ------------------------------------------------------------------------------------------------------
 
 
-def test_the_same_seed_gives_the_same_checkpoint_and_another_one_another(tmp_path: Path) -> None:
-    a = build_tiny("llava-next-video", tmp_path / "a")
-    assert folder_digest(a) == folder_digest(checkpoint("llava-next-video"))
-    assert folder_digest(build_tiny("llava-next-video", tmp_path / "b", seed=1)) != folder_digest(a)
-
-
 def test_what_weights_take_is_read_off_their_files() -> None:
     folder = checkpoint("qwen3-vl")
     numbers = sum(tensor.numel() for tensor in load_file(folder / "model.safetensors").values())
@@ -312,20 +270,6 @@ def test_a_checkpoint_of_another_kind_is_refused(tmp_path: Path) -> None:
     (folder / "config.json").write_text(json.dumps({"model_type": "bert", "architectures": ["BertModel"]}))
     with pytest.raises(TrapsError, match="cannot load it as an image-text-to-text model"):
         load_local_model(entry("qwen3-vl", folder))
-
-
-def test_a_file_that_is_no_safetensors_is_refused(tmp_path: Path) -> None:
-    folder = altered(tmp_path)
-    (folder / "model.safetensors").write_bytes(b"no weights")
-    with pytest.raises(TrapsError, match=r"model\.safetensors: no safetensors file"):
-        load_local_model(entry("qwen3-vl", folder))
-
-
-def test_a_model_without_the_expected_layers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    of = model("llava-next-video")
-    monkeypatch.setattr(of.network.config.text_config, "num_hidden_layers", 7)
-    with pytest.raises(TrapsError, match=r"has not the expected layers \(get_decoder\(\)\.layers: 4, .* says 7"):
-        local_model._decoder_parts(of.network, "llava")
 
 
 def test_too_little_memory_says_how_much_is_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -374,14 +318,6 @@ def test_a_chat_template_that_loses_the_system_prompt_is_refused(tmp_path: Path)
     of = load_local_model(entry("qwen3-vl", folder))
     with pytest.raises(TrapsError, match="does not keep system prompt, clip and question"):
         ask(of)
-
-
-@each_family
-def test_a_layer_out_of_range_is_refused(family: Family) -> None:
-    blocks = model(family).n_layers
-    for layer in (0, blocks + 1, -1):
-        with pytest.raises(TrapsError, match=rf"no block {layer}; it has blocks 1 to {blocks} "):
-            model(family).block(layer)
 
 
 # --- a fourth class ---------------------------------------------------------------------------------------------------
