@@ -20,7 +20,7 @@ from traps_pipeline.exchange.answer_exchange import Whose, import_answers
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
-from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
+from traps_pipeline.release.harness.scoring import RUN_FIGURES, figures, judge
 from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
@@ -240,7 +240,7 @@ def test_lmms_eval_gives_the_same_figures_to_the_last_digit(
     lmms_evaluated: tuple[dict[str, Any], Path], workspace: Workspace, model: str
 ) -> None:
     expected = ours(workspace, model, "standard")
-    assert lmms_evaluated[0][model] == {name: expected[name] for name in FIGURES} | {"missing": 0, "unread": 0}
+    assert lmms_evaluated[0][model] == {name: expected[name] for name in RUN_FIGURES} | {"missing": 0, "unread": 0}
 
 
 # --- answers come back ------------------------------------------------------------------------------------------------

@@ -57,12 +57,12 @@ def export_results(arguments: argparse.Namespace) -> int:
 def compare_studies(arguments: argparse.Namespace) -> int:
     """See `traps results compare --help`."""
     from traps_pipeline.judging.judging_rows import VERDICTS
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
+    from traps_pipeline.storage.benchmark_tables import current_rows
     from traps_pipeline.storage.workspace import Workspace
 
     studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
-    then, now = (current(study, VERDICTS) for study in studies)
+    then, now = (current_rows(study, VERDICTS) for study in studies)
     table = version_contrasts(then, now)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))

@@ -150,7 +150,7 @@ class FigureReport:
         return figure
 
 
-TABLES: tuple[TableReport, ...] = (
+TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("overall", leaderboards.overall, ("leaderboard",), printed_scores.overall, recomputed=("overall",)),
     TableReport("replication_overall", leaderboards.replication_overall, ("leaderboard",),
         printed_scores.replication_overall, recomputed=("replication_overall",)),
@@ -204,7 +204,7 @@ TABLES: tuple[TableReport, ...] = (
     TableReport("hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"),
         printed_setup.hyperparameters),
 )  # fmt: skip
-FIGURES: tuple[FigureReport, ...] = (
+FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),
     FigureReport("visual_textual", "Visual against textual voids", abstention.visual_textual, ("leaderboard",)),
     FigureReport("abs_rec", "AbsRec, standard and guided", abstention.abs_rec_by_model, ("leaderboard",)),

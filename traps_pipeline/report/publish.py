@@ -21,7 +21,7 @@ from traps_pipeline.report.cards import (
     picture_card,
     table_card,
 )
-from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.pair_pictures import PairPictures
@@ -55,7 +55,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
         Part("figures", report.name, lambda report=report: figure_card(report, sources), report.reads)
-        for report in sorted(FIGURES, key=lambda report: report.name not in first)
+        for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
     pictures = [
         Part(
@@ -69,11 +69,11 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     ]
     tables = [
         Part("tables", report.name, lambda report=report: table_card(report, sources, address), report.reads)
-        for report in TABLES
+        for report in TABLE_REPORTS
     ]
     paper = [
         Part(PAPER, f"{kind}-{report.name}", lambda report=report: paper_card(report, sources), ("published",))
-        for kind, reports in (("figure", FIGURES), ("table", TABLES))
+        for kind, reports in (("figure", FIGURE_REPORTS), ("table", TABLE_REPORTS))
         for report in reports
         if report.published
     ]
@@ -121,7 +121,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 
 def _exported(sources: Sources, say: Callable[[str], None]) -> Iterator[tuple[str, bytes]]:
     for source in (sources.study, sources.paper):
-        for report in [r for r in (*TABLES, *FIGURES) if source.is_study or r.published]:
+        for report in [r for r in (*TABLE_REPORTS, *FIGURE_REPORTS) if source.is_study or r.published]:
             yield from report.files(source).items()
             say(f"{source.source}: {report.name}")
     yield from ((f"tables/{RECOMPUTED}/{name}", content) for name, content in table_files(audit_table()).items())

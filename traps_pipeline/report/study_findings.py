@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
-from traps_pipeline.report.catalogue import FIGURES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
 from traps_pipeline.report.writing import fraction, percent
@@ -41,7 +41,7 @@ def study_findings(results: Results) -> list[Finding]:
     references = models_of(group="reference")
     own = rows.loc[[model not in references for model in rows["model"]]]
     own = own if len(own) else rows
-    inside = [(report.name, report.finding(results)) for report in FIGURES] if results.mechanism else []
+    inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
         *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
         *_missing(own), *(Finding(text, f"figure-{name}") for name, text in inside if text),

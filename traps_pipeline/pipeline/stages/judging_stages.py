@@ -52,11 +52,11 @@ def _panel(workspace: Workspace) -> list[str]:
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     """Return the votes of the study's panel as it is now. Raises TrapsError if there is none."""
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.models.judges import panel_id
     from traps_pipeline.protocol.ratings import VOTE_COLUMNS
+    from traps_pipeline.storage.benchmark_tables import current_rows
 
-    votes = current(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
+    votes = current_rows(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
     votes = votes.loc[votes["panel"] == panel_id(workspace.study.panel)]
     if votes.empty:
         raise TrapsError(f"{name}: no votes yet; materialize votes for a cell first")
@@ -80,12 +80,12 @@ def _make_judge_bias(workspace: Workspace, _: None) -> StageOutput:
 
 def _make_leave_one_out(workspace: Workspace, _: None) -> StageOutput:
     """Return PECS by the votes of two judges, for each judge that is left out."""
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.leave_one_out import leave_one_out
+    from traps_pipeline.storage.benchmark_tables import current_rows
 
     cast, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
     return made_of(
-        "leave one out", LEAVE_ONE_OUT, leave_one_out(current(workspace, VERDICTS), cast, board, _panel(workspace))
+        "leave one out", LEAVE_ONE_OUT, leave_one_out(current_rows(workspace, VERDICTS), cast, board, _panel(workspace))
     )
 
 

@@ -67,11 +67,11 @@ def _make_row(workspace: Workspace, _: None) -> StageOutput:
 
 def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return all HUMAN_LABELS rows, and the VERDICTS rows of the study's panel."""
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.models.judges import panel_id
+    from traps_pipeline.storage.benchmark_tables import current_rows
 
     labels = workspace.tables.read(HUMAN_LABELS, {})
-    judged = current(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # they are many
+    judged = current_rows(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # they are many
     own = judged.loc[judged["panel"] == panel_id(workspace.study.panel)]
     return labels, own.reset_index(drop=True)
 

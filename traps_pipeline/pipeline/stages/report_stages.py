@@ -13,7 +13,7 @@ from traps_pipeline.pipeline.stages import (
     people_stages,
     scoring_stages,
 )
-from traps_pipeline.report.catalogue import FIGURES, TABLES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, TABLE_REPORTS
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
@@ -72,7 +72,9 @@ report_page = stage(
     "report_page",
     _report_page,
     group=GROUP,
-    parents=_parents(*ANSWERS, "arms", *SCORES, *(r for each in (*TABLES, *FIGURES) for r in each.reads), "published"),
+    parents=_parents(
+        *ANSWERS, "arms", *SCORES, *(r for each in (*TABLE_REPORTS, *FIGURE_REPORTS) for r in each.reads), "published"
+    ),
     kinds=["html"],
 )
 site = stage(

@@ -24,10 +24,10 @@ GROUP = "scoring"
 
 def _make_metrics(workspace: Workspace, dataset: str) -> StageOutput:
     """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.metrics import cell_metrics
+    from traps_pipeline.storage.benchmark_tables import current_rows
 
-    judged = current(workspace, VERDICTS, dataset=dataset)
+    judged = current_rows(workspace, VERDICTS, dataset=dataset)
     if judged.empty:
         raise TrapsError(f"metrics {dataset}: no verdicts yet; materialize verdicts for a cell of this dataset first")
     return StageOutput(cell_metrics(judged))
@@ -58,12 +58,12 @@ metrics = stage(
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return all METRICS rows of the pairs, and the VERDICTS rows from which they are made, without arms."""
-    from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.storage.benchmark_tables import current_rows
 
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
         raise TrapsError(f"{name}: no metrics yet; materialize metrics for a dataset first")
-    return cells, current(workspace, VERDICTS)
+    return cells, current_rows(workspace, VERDICTS)
 
 
 def _make_contrasts(workspace: Workspace, _: None) -> StageOutput:
@@ -111,10 +111,10 @@ def _wrong_intervals(workspace: Workspace, key: str | None, output: StageOutput)
 def _make_robust(workspace: Workspace, _: None) -> StageOutput:
     """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm;
     empty if no arm was run."""
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.robust import robust as without_shortcuts
+    from traps_pipeline.storage.benchmark_tables import current_rows
 
-    judged = current(workspace, VERDICTS, dataset=(*DATASETS, *ARMS))
+    judged = current_rows(workspace, VERDICTS, dataset=(*DATASETS, *ARMS))
     if judged.empty:
         raise TrapsError("robust: no verdicts yet; materialize verdicts for a cell first")
     return made_of("conjunction", ROBUST, without_shortcuts(judged))
@@ -130,12 +130,11 @@ def _wrong_robust(workspace: Workspace, key: str | None, output: StageOutput) ->
 def _make_hypotheses(workspace: Workspace, _: None) -> StageOutput:
     """Abstention and accuracy as one thing of the pairs is changed step by step, beside what rules get; empty if no
     variation was run."""
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.doses import DATASETS_READ
     from traps_pipeline.scoring.doses import hypotheses as by_dose
-    from traps_pipeline.storage.benchmark_tables import ITEMS
+    from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 
-    judged = current(workspace, VERDICTS, dataset=DATASETS_READ)
+    judged = current_rows(workspace, VERDICTS, dataset=DATASETS_READ)
     items = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
     offered = {str(id_): len(labels) for id_, labels in zip(items["item_id"], items["labels"], strict=True)}
     return made_of("doses", HYPOTHESES, by_dose(judged, offered))

@@ -58,7 +58,7 @@ class At(NamedTuple):
 
 _LAYER_AND_VALUE = ("layer", "value", "low", "high")
 # The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
-FIGURES = {
+PAIR_FIGURES = {
     "best": At("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
     "chosen": At("transfer", "chosen", _LAYER_AND_VALUE),
     "held_out": At("held_out", "all_sample_best"),
@@ -77,7 +77,7 @@ BASELINES = {
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target,
-    and Cf->Cf at its own and at the best layer, as FIGURES."""
+    and Cf->Cf at its own and at the best layer, as PAIR_FIGURES."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -86,12 +86,16 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     asked = by_pair("transfer", rows["model"].notna())
     known = rows["value"].notna()
-    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in FIGURES.items()}
+    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
-        | {f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan) for name, at in FIGURES.items() for c in at.columns}
+        | {
+            f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
+            for name, at in PAIR_FIGURES.items()
+            for c in at.columns
+        }
         | {"note": next((of[key]["note"] for of in notes if key in of), "")}
         for model in rows["model"].unique()
         for key in ((str(model), *pair) for pair in TRANSFER_PAIRS)
@@ -168,7 +172,7 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
         beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in FIGURES), *beside, "held_noise", "cf_held_noise"]
+        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *beside, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = {
             **dict.fromkeys(figures, "mean"),
