@@ -68,13 +68,13 @@ import json
 import dagster as dg
 import pyarrow.parquet as pq
 from traps_pipeline.definitions import defs
-from traps_pipeline.pipeline.graph import Collect, Source, name_of, the_graph
+from traps_pipeline.pipeline.graph import Source, name_of, the_graph
 from traps_pipeline.pipeline.lineage import Lineage, _report_state
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.pipeline.runs import RunsHere
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 
 workspace, graph = Workspace.open(), the_graph()
 job = defs.resolve_implicit_global_asset_job_def()
@@ -104,32 +104,31 @@ def meanwhile(stage, key, parent):
         undo.append(change(*parent))
         return found
     def collected(workspace, keys):
-        for found in make.partitions(workspace, keys):
+        for found in make(workspace, keys):
             undo.append(change(*parent))
             yield found
-    object.__setattr__(stage, "make", Collect(collected) if isinstance(make, Collect) else made)
+    object.__setattr__(stage, "make", collected if stage.side_by_side else made)
     try:
         [ran] = RunsHere(history, job).make([stage], [(key, key)], {})
         problems = ran.problems
         status = Lineage(workspace).status(stage.name, key)
     finally:
         object.__setattr__(stage, "make", make)
-        object.__setattr__(stage, "collect", collect)
         for one in undo:
             one()
     told = {"changed": name_of(parent), "problems": problems, "told": len(undo), "why": status.reasons}
     return {"stage": stage.name, **told}
 
 def made_above(stage):
-    key, versions = stage.wanted(Wanted(workspace))[0], Lineage(workspace)
+    key, versions = stage.wanted(StudyPartitions(workspace))[0], Lineage(workspace)
     return [(p, k) for p, keys in graph.parents(stage.name, key).items() for k in keys if versions.version(p, k)]
 
 # Nothing is gated here, since no experiment asks the tiny model; what is made from that has nothing above it.
-wanted = [stage for stage in graph.stages if stage.wanted(Wanted(workspace)) and made_above(stage)]
+wanted = [stage for stage in graph.stages if stage.wanted(StudyPartitions(workspace)) and made_above(stage)]
 print("STAGES", *(stage.name for stage in wanted))
 with dagster_history(workspace) as history:
     for stage in wanted:
-        print("MADE", json.dumps(meanwhile(stage, stage.wanted(Wanted(workspace))[0], made_above(stage)[-1])))
+        print("MADE", json.dumps(meanwhile(stage, stage.wanted(StudyPartitions(workspace))[0], made_above(stage)[-1])))
 """
 
 

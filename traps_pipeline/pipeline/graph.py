@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Any, Literal
@@ -95,19 +95,10 @@ class ConcurrentBuild:
 
 
 @dataclass(frozen=True)
-class Collect:
-    """Makes several partitions side by side, and hands each on when it is done."""
-
-    partitions: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, StageOutput]]]
-
-
-Make = Callable[[Workspace, Any], StageOutput]  # makes one partition
-
-
-@dataclass(frozen=True)
 class Stage:
     """Something that is made: a table, or files for people (table: None).
 
+    make: returns the StageOutput of a key; of `side_by_side`, it takes several keys and yields each with its own.
     code: raise it when the formula changes, and what was made before is stale. cost: what making it takes besides
     seconds. wants: whether a study wants a key at all. lost: what is missing of the files that a partition names.
     takes: what a run of it takes of a host. shared: how several runs make a partition at once, where they may.
@@ -115,7 +106,7 @@ class Stage:
 
     name: str
     table: Table | None
-    make: Make | Collect
+    make: Callable[[Workspace, Any], Any]
     group: str
     parents: Mapping[str, Parent]
     doc: str
@@ -128,6 +119,7 @@ class Stage:
     lost: Callable[[Workspace, Any], list[str]]
     takes: RunResources = RunResources()
     shared: ConcurrentBuild | None = None
+    side_by_side: bool = False
 
     def columns(self, key: str | None) -> Mapping[str, Any]:
         """Return values of the table's partition columns for a key."""

@@ -15,7 +15,6 @@ from traps_pipeline.pipeline.graph import (
     DECLARED,
     GROUPS,
     Check,
-    Collect,
     ConcurrentBuild,
     Cost,
     Parent,
@@ -103,7 +102,7 @@ def stage(
         one = Stage(
             name=table if isinstance(table, str) else table.name,
             table=None if isinstance(table, str) else table,
-            make=Collect(function) if side_by_side else make,
+            make=function if side_by_side else make,
             group=group,
             parents={parent.name: parent for parent in above},
             doc=_doc(function),
@@ -116,6 +115,7 @@ def stage(
             lost=lost,
             takes=takes or RunResources(),
             shared=shared,
+            side_by_side=side_by_side,
         )
         _declare(one)
         return one
