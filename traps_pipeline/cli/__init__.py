@@ -18,24 +18,19 @@ from traps_pipeline.base.files import remedy
 from traps_pipeline.base.redaction import redact_tracebacks
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
-    annotate_commands,
     benchmark_commands,
     completion_commands,
-    confabulation_commands,
     doctor_commands,
     exchange_commands,
     init_commands,
-    judges_commands,
     ledger_commands,
     models_commands,
+    people_commands,
     plan_commands,
-    release_commands,
+    publish_commands,
     results_commands,
-    review_commands,
     run_commands,
-    site_commands,
     status_commands,
-    submission_commands,
     ui_commands,
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run
@@ -160,16 +155,11 @@ def build_parser() -> Parser:
         ui_commands,
         exchange_commands,
         ledger_commands,
-        site_commands,
         results_commands,
         benchmark_commands,
         models_commands,
-        judges_commands,
-        review_commands,
-        annotate_commands,
-        confabulation_commands,
-        release_commands,
-        submission_commands,
+        people_commands,
+        publish_commands,
         completion_commands,
     ):
         module.add(commands)

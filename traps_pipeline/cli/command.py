@@ -134,7 +134,11 @@ class Commands:
             f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
         )
         parser = self._parsers[group].add_parser(
-            name, help=text, description=text, epilog=shown + codes, formatter_class=_Help
+            name,
+            help=text,
+            description=text,
+            epilog=shown + codes,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
@@ -146,10 +150,6 @@ class Commands:
         if json:
             parser.add_argument("--json", action="store_true", help="print the result as JSON")
         return parser
-
-
-class _Help(argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of the example and the exit codes."""
 
 
 def _show_help(arguments: argparse.Namespace) -> int:
