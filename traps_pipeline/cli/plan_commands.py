@@ -24,7 +24,6 @@ from traps_pipeline.cli.command import (
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.cost import Cost
     from traps_pipeline.models.forecast import Forecast
-    from traps_pipeline.pipeline.forecast_plan import Count
 
 
 def add(commands: Commands) -> None:
