@@ -42,11 +42,11 @@ class Finding:
 def examine(place: Place) -> Iterator[Finding]:
     """Yield one finding for each requirement of the demo."""
     for what, look in (
-        ("python", _python),
+        ("python", lambda: sys.version.split()[0]),
         ("checkout", _checkout),
         ("rendering", draw_frame),
         ("encoding", encode_clip),
-        ("disk", lambda: _disk(scratch_of(place) if isinstance(place, str) else place)),
+        ("disk", lambda: check_disk(scratch_of(place) if isinstance(place, str) else place, MIN_FREE_GB)),
         ("clip cache", _clip_cache),
         ("workspace", lambda: _workspace(place)),
         ("keys", _keys),
@@ -103,6 +103,8 @@ def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
 
 def examine_files(place: Place) -> Iterator[Finding]:
     """Yield every file of a study that says what it must hold, read whole: one finding for each kind."""
+    from traps_pipeline.mechanism.hidden_states import damage
+    from traps_pipeline.storage.parquet import altered
     from traps_pipeline.storage.workspace import Workspace
 
     workspace = Workspace.open(place)
@@ -118,14 +120,10 @@ def examine_files(place: Place) -> Iterator[Finding]:
     if workspace.is_shared:
         yield Finding(not missing, "store", "; ".join(missing[:SHOWN]) or "every object is what was written")
     for what, files, damage_of in (
-        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
+        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
         ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
-        (
-            "states",
-            sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)),
-            _damaged_states,
-        ),
+        ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
     ):
         damaged = [message for path in files if (message := damage_of(path))]
@@ -160,12 +158,6 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
     )
 
 
-def _damaged_table(path: Path) -> str:
-    from traps_pipeline.storage.parquet import altered
-
-    return altered(path)
-
-
 def _damaged_clip(path: Path) -> str:
     from traps_pipeline.scenes.worlds.clips import DamagedClip, read_clip
 
@@ -187,12 +179,6 @@ def _damaged_media(note: Path) -> str:
     except (DamagedClip, ValueError) as error:
         return str(error)
     return ""
-
-
-def _damaged_states(path: Path) -> str:
-    from traps_pipeline.mechanism.hidden_states import damage
-
-    return damage(path)
 
 
 def _damaged_history(path: Path) -> str:
@@ -221,10 +207,6 @@ def _finding(what: str, look: Callable[[], str]) -> Finding:
         return Finding(False, what, f"{error}")
 
 
-def _python() -> str:
-    return sys.version.split()[0]
-
-
 def _checkout() -> str:
     from traps_pipeline.base.paths import require_root
     from traps_pipeline.benchmark.corrections import read_corrections
@@ -234,10 +216,6 @@ def _checkout() -> str:
     root, release = require_root(), load_release()
     counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
     return f"{root}: {release.name} {release.version}, {counts}"
-
-
-def _disk(root: Path) -> str:
-    return check_disk(root, MIN_FREE_GB)
 
 
 def _clip_cache() -> str:
