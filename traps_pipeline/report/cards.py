@@ -111,7 +111,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
         except NotRun:
             pictures = {}
         return Card(_name(report), report.title, _fragment("figures", pictures=pictures, alt=report.title))
-    published = {"As the paper prints it": report.as_printed()} if report.paper else {}
+    published = {"As the paper prints it": printed} if (printed := report.as_printed()) else {}
     if report.recomputed:
         published["Recomputed from the published tables"] = report.tables(sources.paper)
     tables = {words: tables_html(each, "", None) for words, each in published.items()}

@@ -11,12 +11,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
-from traps_pipeline.report import findings
+from traps_pipeline.report import findings, printed_tables
 from traps_pipeline.report.figures import abstention, expression_figures, grids, landscape, steering_figures
 from traps_pipeline.report.figures import control_figures as figures_of_inside
-from traps_pipeline.report.printed import printed_mechanism as printed_mechanism
-from traps_pipeline.report.printed import printed_scores as printed_scores
-from traps_pipeline.report.printed import printed_setup as printed_setup
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables import (
     comparisons,
@@ -43,20 +40,8 @@ RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the pape
 # Stages whose tables hold figures that the panel decided: what reads one of them says who judged. Tests hold this
 # against the graph.
 JUDGED_STAGES = {
-    "leaderboard",
-    "metrics",
-    "contrasts",
-    "regime_tests",
-    "hypotheses",
-    "leave_one_out",
-    "steering_effects",
-    "steering_shares",
-    "steering_nulls",
-    "steering_pecs",
-    "gate",
-    "risk_coverage",
-    "item_scores",
-    "corrected",
+    *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "leave_one_out", "item_scores", "corrected"),
+    *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs", "gate", "risk_coverage"),
 }
 
 
@@ -99,8 +84,8 @@ class TableReport:
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's own tables."""
-        return self.paper() if self.paper else []
+        """Return the paper's own tables, and what stands only in its text."""
+        return [*(self.paper() if self.paper else []), *printed_tables.in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return files by path: `tables/name.csv` and so on; for the paper, its tables as printed in `tables/published`
@@ -151,58 +136,57 @@ class FigureReport:
 
 
 TABLE_REPORTS: tuple[TableReport, ...] = (
-    TableReport("overall", leaderboards.overall, ("leaderboard",), printed_scores.overall, recomputed=("overall",)),
+    TableReport("overall", leaderboards.overall, ("leaderboard",), printed_tables.overall, recomputed=("overall",)),
     TableReport("replication_overall", leaderboards.replication_overall, ("leaderboard",),
-        printed_scores.replication_overall, recomputed=("replication_overall",)),
-    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_scores.per_dataset),
-    TableReport("expanded", leaderboards.expanded, ("leaderboard",), printed_scores.expanded,
+        printed_tables.replication_overall, recomputed=("replication_overall",)),
+    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_tables.per_dataset),
+    TableReport("expanded", leaderboards.expanded, ("leaderboard",), printed_tables.expanded,
         title="By dataset and regime"),
     TableReport("replication_per_dataset", leaderboards.replication_per_dataset, ("leaderboard",),
-        printed_scores.replication_per_dataset),
-    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts"), printed_scores.guided_uplift,
+        printed_tables.replication_per_dataset),
+    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts"),
         recomputed=("guided_uplift",)),
-    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",), printed_scores.visual_textual,
+    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",), printed_tables.visual_textual,
         recomputed=("visual_textual",)),
     TableReport("reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts"),
         recomputed=("reasoning_pairs",)),
     TableReport("frontier", comparisons.frontier, ("leaderboard",), recomputed=("frontier",)),
-    TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_scores.naive, recomputed=("pecs_naive",)),
-    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",), printed_scores.zero_boundary,
+    TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_tables.naive, recomputed=("pecs_naive",)),
+    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",),
         recomputed=("zero_boundary",)),
     TableReport("contrasts", comparisons.contrasts, ("leaderboard", "contrasts")),
     TableReport("regime_tests", comparisons.regime_tests, ("regime_tests",)),
-    TableReport("run_spread", comparisons.spreads, ("leaderboard",), printed_scores.run_spread,
-        recomputed=("run_spread",)),
-    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_scores.degenerate),
+    TableReport("run_spread", comparisons.spreads, ("leaderboard",), recomputed=("run_spread",)),
+    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_tables.degenerate),
     TableReport("occlusion_sub_scenarios", sub_scenarios.occlusion_sub_scenarios, ("metrics", "items"),
-        printed_scores.occlusion_sub_scenarios, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
+        printed_tables.occlusion_sub_scenarios, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
     TableReport("chaotic_sub_scenarios", sub_scenarios.chaotic_sub_scenarios, ("metrics", "items"),
-        printed_scores.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
+        printed_tables.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
     TableReport("hypotheses", hypothesis_tables.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
-    TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_setup.agreement),
+    TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_tables.agreement),
     TableReport("judge_bias", judge_tables.judge_bias, ("judge_bias", "leave_one_out")),
     TableReport("confabulation", judge_tables.confabulation, ("confabulation_prevalence",),
-        printed_setup.confabulation),
+        printed_tables.confabulation),
     TableReport("people", human_tables.people, ("human_row", "human_agreement"), title="People"),
     TableReport("judge_corrected", human_tables.judge_corrected, ("panel_errors", "corrected"),
         title="Corrected for judges’ errors"),
-    TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_setup.validation),
-    TableReport("probes", tables_of_probes.probes, ("probes", "probe_baselines"), printed_mechanism.probes,
+    TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_tables.validation),
+    TableReport("probes", tables_of_probes.probes, ("probes", "probe_baselines"), printed_tables.probes,
         ("probe_means",), "Probes"),
     TableReport("probe_baselines", control_reports.probe_baselines, ("probes", "probe_baselines"),
         title="Probes and their baselines"),
     TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", tables_of_patching.patching, ("patching",)),
-    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines,
+    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_tables.cosines,
         title="Void directions"),
     TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"),
-        printed_mechanism.steering, recomputed=("steering_regimes",), title="Steering"),
+        printed_tables.steering, recomputed=("steering_regimes",), title="Steering"),
     TableReport("steering_controls", control_reports.steering_nulls, ("steering_nulls", "steering_pecs"),
         title="Steering among its controls"),
-    TableReport("composition", setup_tables.composition, ("items",), printed_setup.composition),
-    TableReport("models", setup_tables.models, ("leaderboard",), printed_setup.models),
+    TableReport("composition", setup_tables.composition, ("items",), printed_tables.composition),
+    TableReport("models", setup_tables.models, ("leaderboard",), printed_tables.models),
     TableReport("hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"),
-        printed_setup.hyperparameters),
+        printed_tables.hyperparameters),
 )  # fmt: skip
 FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),

@@ -80,7 +80,7 @@ def _confabulation(results: Results) -> pd.DataFrame:
 class PublishedResults(Results):
     """The paper's numbers, as shipped in `assets/published`, from which figures are drawn and further tables computed.
 
-    The tables that the paper prints are shown by `report.printed`. A frame from which neither is made has no rows.
+    `report.printed_tables` shows those that the paper prints. A frame from which neither is made has no rows.
     """
 
     source = "published"
