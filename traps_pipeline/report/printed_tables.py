@@ -76,12 +76,10 @@ def _cells(group: str) -> pd.DataFrame:
     """Return the cells of a group's models, with `figure ± spread` where a spread is printed."""
     cells: pd.DataFrame = as_printed("behavioral_per_dataset")
     cells = cells.loc[cells["model"].isin(models_of(group=group))]
-    pairs = {
-        field: zip(cells[field], cells[spread], strict=True) for field, spread in zip(SHARES, SPREADS, strict=True)
-    }
-    return cells.assign(
-        **{f: [f"{value} ± {spread}" if spread else value for value, spread in p] for f, p in pairs.items()}
-    )
+    for field, spread in zip(SHARES, SPREADS, strict=True):
+        pairs = zip(cells[field], cells[spread], strict=True)
+        cells = cells.assign(**{field: [f"{value} ± {deviation}" if deviation else value for value, deviation in pairs]})
+    return cells
 
 
 def _of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
@@ -135,11 +133,8 @@ def naive() -> list[PrintedTable]:
     """Return the cells under guided in which Acc × AbsRec exceeds PECS most."""
     rows = as_printed("pecs_vs_naive")
     rows = titled(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
-    return [
-        of_paper(
-            "pecs_naive", rows, [MODEL, DATASET, *figures({"naive": "Naive", "pecs": "PECS", "false_abs_pct": "FA"})]
-        )
-    ]
+    names = {"naive": "Naive", "pecs": "PECS", "false_abs_pct": "FA"}
+    return [of_paper("pecs_naive", rows, [MODEL, DATASET, *figures(names)])]
 
 
 def degenerate() -> list[PrintedTable]:
