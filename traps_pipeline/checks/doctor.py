@@ -56,9 +56,7 @@ def examine(place: Place) -> Iterator[Finding]:
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield one finding for each requirement of local models: the three families on tiny checkpoints, devices and
-    weights, and what looking into a model takes for granted, of those and of the models of the registry that are named.
-    """
+    """Yield a finding for each requirement of local models: tiny checkpoints, devices, weights, named models."""
     from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
@@ -135,9 +133,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return the objects in a study's store that nobody names and that are older than the grace period, and which of
-    them were removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be
-    used."""
+    """Return the old objects in a study's store that nobody names, and whether they were removed. Raises TrapsError."""
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
@@ -235,8 +231,7 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """Return the keys that are not set, and the models and judges that need them. The demo needs no key. Raises
-    TrapsError for one that no header can carry."""
+    """Return the keys that are not set, and who needs them. Raises TrapsError for one that no header can carry."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 

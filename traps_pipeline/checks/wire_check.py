@@ -79,8 +79,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return one request of every form that a study sends to an entry: for a model by regime, for a judge by task (and
-    a label of confabulation, if the judge labels it)."""
+    """Return a request of every form that a study sends: by regime for a model, by task and label for a judge."""
     if isinstance(entry, ModelEntry):
         sent = _studio().prepare(entry.media) if entry.media else None
         return {regime: question(entry, regime, _QUESTION, sent, {"regime": regime}) for regime in REGIMES}
@@ -126,8 +125,7 @@ def _short(value: Any) -> str:
 
 
 def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
-    """Yield the problems of the turns: system prompt and question must arrive verbatim, with the clip before the
-    question and nothing else."""
+    """Yield what is wrong with the turns: prompt and question are verbatim, the clip before the question, no more."""
     roles = [role for role, _ in turns]
     if roles != ["system", "user"]:
         yield f"the turns are {roles}, not system and user"
@@ -279,8 +277,7 @@ def participants() -> dict[str, Entry]:
 
 
 def check_named(names: Sequence[str]) -> Iterator[Checked]:
-    """Check the entries with these ids; without any ids, all entries that send or show something. Raises TrapsError for
-    an unknown id."""
+    """Check the entries with these ids, or all that send or show something. Raises TrapsError for an unknown id."""
     known = participants()
     if unknown := [name for name in names if name not in known]:
         raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")

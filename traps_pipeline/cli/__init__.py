@@ -60,8 +60,7 @@ needs to complete them."""
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
-    """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
-    interrupted. parser: that of another program which ends as this one does."""
+    """Run a subcommand; return 0 done, 1 failed, 2 bad usage, 4 over budget, 130 interrupted. parser: another's."""
     gc.set_threshold(50_000, 20, 20)  # imported objects stay: searching them for garbage costs half a second
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

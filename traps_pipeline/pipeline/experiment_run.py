@@ -120,8 +120,7 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
 
 
 def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
-    """Try the models and judges over the network, before a clip is rendered. Raises TrapsError naming all that is
-    wrong."""
+    """Try the models and judges over the network first. Raises TrapsError naming all that is wrong."""
     models = [entry for entry in participants.models if entry.backend == NETWORK]
     if not models and not participants.judges:
         return

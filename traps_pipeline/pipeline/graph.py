@@ -36,10 +36,7 @@ GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
 
 @dataclass(frozen=True)
 class Check:
-    """A check of each partition. wrong: what is wrong with it, in words or as data; empty where it passes.
-
-    blocks: nothing is made from a partition that does not pass.
-    """
+    """A check of each partition. wrong: what is wrong, or empty; blocks: nothing is made from one that fails."""
 
     name: str
     doc: str
@@ -211,8 +208,7 @@ class Graph:
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
-        """Return every partition that a partition may be made from, whether it is there or not: keys by stage or
-        source."""
+        """Return every partition that one may be made from, whether it is there or not, by stage or source."""
         scheme = self.declared[name].scheme
         if key is not None and (scheme is None or key not in scheme.known):
             return {}  # of an experiment that the study has no more

@@ -63,8 +63,7 @@ class PartitionMaker:
     # --- beside other runs --------------------------------------------------------------------------------------------
 
     def _beside_others(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make files that no other run is at, then wait for theirs; who holds a partition's lease makes the partition,
-        and the others take it over."""
+        """Make files that no other run is at, wait for theirs; the holder of its lease makes a partition."""
         store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
         self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
         with kept_workers():
@@ -95,8 +94,7 @@ class PartitionMaker:
         return is_whole
 
     def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
-        """Return whether another run has made a partition of the same inputs since this step began, and has told
-        Dagster of it, so that it was checked, too."""
+        """Return whether another run has made a partition of the same inputs meanwhile, and told Dagster of it."""
         stage, lineage = self._stage, Lineage(self._workspace)
         state = lineage.state(stage.name, key)
         if state is None or lineage.made_at(stage.name, key) == self._made_at[key]:

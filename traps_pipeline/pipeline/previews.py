@@ -33,8 +33,7 @@ class Records:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A file of the study that a browser opens. path: below the workspace's root, so that it is right in a copy; view:
-    the part of its address after #."""
+    """A file that a browser opens. path: below the workspace's root; view: the part of its address after #."""
 
     path: str
     view: str = ""

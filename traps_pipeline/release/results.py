@@ -37,8 +37,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Who:
-    """organization: who made the evaluation. developer: of the models that are no reference models, as the hub names
-    it."""
+    """Who made the evaluation, and who develops the models that are no reference models."""
 
     organization: str = "unknown"
     developer: str = "unknown"

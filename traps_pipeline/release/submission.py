@@ -96,8 +96,7 @@ class Submission:
 
 
 def pack(workspace: Workspace, target: Path, name: str) -> About:
-    """Write a study's submission; the same study gives the same bytes. Raises TrapsError where it is not judged or
-    scored yet."""
+    """Write a study's submission, equal bytes for equal studies. Raises TrapsError if not judged or scored yet."""
     study = workspace.study
     frames = {
         "items.parquet": workspace.tables.read_all(ITEMS, dataset=DATASETS),
@@ -159,8 +158,7 @@ def _zipped(content: Mapping[str, bytes]) -> bytes:
 
 
 def read_submission(path: Path) -> Submission:
-    """Return a submission from its file. Raises TrapsError for a file that is none: other names, too large, compressed
-    as a whole, other columns, or text where a table should be."""
+    """Return a submission. Raises TrapsError for other names or columns, too much, compression, or no table."""
     try:
         size = path.stat().st_size
         if size > MOST_FILE_BYTES:

@@ -37,18 +37,9 @@ Address = Callable[[Behind], str]
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page.
+    """A part of the page: the study's tables or figures (`html`, escaped), or `why` it was not run; the paper's beside.
 
-    Parameters
-    ----------
-    html
-        The study's tables or figures, escaped; empty if the part was not run.
-    why
-        Then the reason.
-    shows
-        What figures show, in words.
-    paper
-        The paper's tables or figures of the kind, escaped.
+    shows: what figures show, in words.
     """
 
     name: str

@@ -1,7 +1,6 @@
-"""Every table and figure by name: the function that makes it from `Results`, and the stages it reads (docs/spec.md 10).
+"""Every table and figure by name: what makes it from `Results`, and the stages it reads (docs/spec.md 10).
 
-A new table or figure is an entry here. Its asset, staleness and place on the report page and in `traps results export`
-follow from the entry.
+Its asset, staleness and place on the report page and in `traps results export` follow from its entry.
 """
 
 from __future__ import annotations
@@ -69,8 +68,7 @@ class TableReport:
         return self.paper is not None or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """Return the tables; of the paper, those recomputed from its numbers, without columns that have no figure. They
-        are made once for a set of results: for their own files and for the page."""
+        """Return the tables, made once; of the paper those recomputed, without columns that have no figure."""
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -88,8 +86,7 @@ class TableReport:
         return [*(self.paper() if self.paper else []), *printed_tables.in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path: `tables/name.csv` and so on; for the paper, its tables as printed in `tables/published`
-        and what follows from them in `tables/recomputed`."""
+        """Return files by path below `tables`; of the paper below `tables/published` and `tables/recomputed`."""
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
@@ -127,8 +124,7 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure; where its numbers are not comparable it says so itself, since pictures lose their
-        captions. Raises NotRun where it has no data."""
+        """Return the figure, which says so itself where rules judged. Raises NotRun where it has no data."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
@@ -228,8 +224,7 @@ def folder(kind: str, results: Results) -> str:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure, or along its right edge where its layout is frozen or a legend is at the
-    foot, for which the layout leaves no second line."""
+    """Write a line at the foot of a figure, or along its right edge where its layout leaves no room there."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}

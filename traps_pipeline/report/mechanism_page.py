@@ -15,8 +15,7 @@ _FLAGS = ("own_best", "all_sample_best", "chosen")
 
 
 def published_probes() -> pd.DataFrame:
-    """Return PROBES rows: transfer, and confabulated (at the layer of the transfer value, since the paper names no
-    other)."""
+    """Return PROBES rows: transfer, and confabulated at the layer of transfer, as the paper names no other."""
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"}).assign(scope="all")
     transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
     confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
@@ -25,9 +24,7 @@ def published_probes() -> pd.DataFrame:
 
 
 def published_cosines() -> pd.DataFrame:
-    """Return COSINES rows: the matrix of qwen3-vl-8b, and the few values of the other two models in the paper's
-    text.
-    """
+    """Return COSINES rows: the matrix of qwen3-vl-8b, and the few values of other models in the paper's text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
     other_figures = published("other")
     other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")].reset_index(

@@ -1,5 +1,4 @@
-"""The paper's tables as the paper prints them: its rows, columns, digits and notes (`assets/published`), without any
-arithmetic on its figures."""
+"""The paper's tables as the paper prints them (`assets/published`), without any arithmetic on their figures."""
 
 from __future__ import annotations
 
@@ -75,10 +74,10 @@ def replication_overall() -> list[PrintedTable]:
 def _cells(group: str) -> pd.DataFrame:
     """Return the cells of a group's models, with `figure ± spread` where a spread is printed."""
     cells: pd.DataFrame = as_printed("behavioral_per_dataset")
-    cells = cells.loc[cells["model"].isin(models_of(group=group))]
+    cells = cells.loc[cells["model"].isin(models_of(group=group))].copy()
     for field, spread in zip(SHARES, SPREADS, strict=True):
         pairs = zip(cells[field], cells[spread], strict=True)
-        cells = cells.assign(**{field: [f"{value} ± {deviation}" if deviation else value for value, deviation in pairs]})
+        cells[field] = [f"{value} ± {deviation}" if deviation else value for value, deviation in pairs]
     return cells
 
 

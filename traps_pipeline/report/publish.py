@@ -39,8 +39,7 @@ PAPER = "paper"  # the chapter of cards that stand beside the study's, and follo
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is made, or what the paper has beside one. reads: the stages that it is made from; inputs:
-    instead, the rows that matter, as JSON; null where all rows matter."""
+    """A card before it is made. reads: its stages; inputs: instead, the rows that matter, as JSON; null for all."""
 
     chapter: str
     name: str
@@ -105,11 +104,9 @@ def metrics_lines(board: pd.DataFrame) -> str:
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write every table (CSV, LaTeX, Markdown, Parquet), every figure that was run (PDF, SVG, PNG) and the report page
-    to a folder, from the study's tables and the published numbers; return the number of files.
+    """Write every table, every figure that was run and the report page to a folder; return the number of files.
 
-    Each file is written whole or not at all, and last `index.html`, which lists them. say gets one line per table and
-    figure.
+    Each file is written whole or not at all, and last `index.html`, which lists them. say gets a line each.
     """
     sources, paths = Sources(workspace), list[str]()
     for path, content in _exported(sources, say):

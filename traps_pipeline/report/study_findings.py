@@ -30,10 +30,7 @@ class Finding:
 
 
 def study_findings(results: Results) -> list[Finding]:
-    """Return the findings of a study, the most important first; none if it has no overall figures.
-
-    Reference strategies, whose score is known, are left out where any other model was asked.
-    """
+    """Return a study's findings, the most important first; of reference strategies only if no other model was asked."""
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):

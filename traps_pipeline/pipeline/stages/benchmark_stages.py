@@ -146,8 +146,7 @@ def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]
     lost=filmed_arms.unmade,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return the arms and variations of a category's scenarios that the study asks: clips and questions beside the
-    pairs."""
+    """Return the arms and variations that the study asks of a category: clips and questions beside the pairs."""
     rows = filmed_arms.build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
     return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
@@ -184,7 +183,6 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, two per pair: the control, and the void that differs from it by one
-    change."""
+    """Return the items that models are asked, two per pair: the control, and the void that differs by one change."""
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})

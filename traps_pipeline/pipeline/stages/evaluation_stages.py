@@ -86,9 +86,7 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
     side_by_side=True,
 )
 def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return answers of a model under a regime in a run, one row per item; answers in the ledger are not asked
-    again.
-    """
+    """Return a model's answers under a regime in a run, one row per item; those in the ledger are not asked again."""
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 

@@ -126,9 +126,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     wants=_gated,
 )
 def item_scores(workspace: Workspace, key: str) -> StageOutput:
-    """Return what states and output say of each item, by probes that have not seen its scenario, beside its
-    verdicts.
-    """
+    """Return what states and output say of each item, by probes that have not seen its scenario, beside verdicts."""
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
@@ -159,9 +157,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
     kinds=["parquet", "pytorch"],
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:
-    """Return indirect effects of groups of positions between matched controls and voids, at every layer, beside
-    nulls.
-    """
+    """Return indirect effects of groups of positions between matched controls and voids by layer, beside nulls."""
     from traps_pipeline.mechanism.patched import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))

@@ -56,8 +56,7 @@ _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 @_stage(AGREEMENT, parents=_VOTED)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
-    Krippendorff."""
+    """Return agreement of the panel and any two judges by dataset and task: unanimity, Fleiss, Cohen, Krippendorff."""
     from traps_pipeline.judging.agreement import agreement as rows_of
 
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))

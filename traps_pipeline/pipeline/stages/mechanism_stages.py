@@ -120,9 +120,7 @@ def _lost_states(workspace: Workspace, key: str) -> list[str]:
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 def hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Return hidden states of a frozen local model at every layer, one row per item; only missing states are
-    extracted.
-    """
+    """Return a frozen local model's hidden states at every layer, one row per item; only missing ones are extracted."""
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
@@ -149,8 +147,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 def probes(workspace: Workspace, key: str) -> StageOutput:
-    """Return probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled,
-    centroids."""
+    """Return probes of every dataset on every other by layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
     from traps_pipeline.mechanism.stages import probe_rows
 
     return StageOutput(probe_rows(workspace, Extraction.parse(key)))
@@ -219,9 +216,7 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
     side_by_side=True,
 )
 def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield the votes of the study's panel on whether each steered answer abstains, and whether a control's is
-    correct.
-    """
+    """Yield the panel's votes on whether each steered answer abstains, and whether a control's is correct."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for done, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):

@@ -57,8 +57,7 @@ def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(HUMAN_ROW, code="2", parents=[human_labels])
 def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return Acc, AbsRec, FalseAbs and PECS of people with intervals, their agreement, and the seconds that a clip
-    takes."""
+    """Return people's Acc, AbsRec, FalseAbs and PECS with intervals, their agreement, and seconds a clip."""
     from traps_pipeline.people.human_scores import human_row as rows_of
 
     return rows_of(workspace.tables.read(HUMAN_LABELS, {}))

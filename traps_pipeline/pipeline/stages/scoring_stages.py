@@ -105,9 +105,7 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
-    """Return every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals,
-    ranks.
-    """
+    """Return every model under every regime, per dataset and overall: means, spreads, 95 % intervals, ranks."""
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
     from traps_pipeline.scoring.standings import leaderboard as rank

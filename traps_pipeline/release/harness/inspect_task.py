@@ -31,9 +31,7 @@ def traps(regime: str = "standard") -> Any:
 
 
 def evaluation(regime: str) -> Any:
-    """Return all items under one regime, once: a further run is a further evaluation, so that PECS is computed per
-    run.
-    """
+    """Return all items under one regime, once: a further run is a further evaluation, as PECS is per run."""
     system = prompt(regime)
     samples = [
         Sample(

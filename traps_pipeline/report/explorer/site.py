@@ -110,8 +110,7 @@ def _files(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str], clips_at: str, *,
     report: bool,
 ) -> dict[str, bytes]:  # fmt: skip
-    """Return the files by path, the index last. clips: those that can be played; clips_at: the folder that holds
-    `clips`."""
+    """Return the files by path, the index last. clips: those that can be played, below the folder clips_at."""
     contents = _contents(workspace, answers, scenarios, clips)
     stamp = _digest(contents)
     files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
@@ -257,9 +256,7 @@ def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the clips that the pages show, as the tables name them. A name that leads out of the folder is left
-    out.
-    """
+    """Return the clips that the pages show, without names that lead out of the folder."""
     named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
     return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
 
@@ -279,11 +276,7 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """Return the one script: the bundled libraries with their licences, then our sources, which share one function's
-    scope.
-
-    Raises TrapsError where the bundle is not the one that was checked in.
-    """
+    """Return the one script: bundled libraries, then our sources. Raises TrapsError for another bundle than ours."""
     library = LIBRARY.read_bytes()
     wanted = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
     if hashlib.sha256(library).hexdigest() != wanted:

@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 
 def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """Return how well each cue alone predicts the side, one column wide: a row of points for each dataset, a line at
-    chance.
-
-    table is the result of `benchmark.shortcuts`.
-    """
+    """Return how well each cue alone predicts the side, from `benchmark.shortcuts`; a line is at chance."""
     datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
     cues = list(dict.fromkeys(table["cue"]))
     with figure_style():

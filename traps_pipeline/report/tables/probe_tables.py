@@ -1,5 +1,4 @@
-"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, nearest centroids; beside the best of
-the raw inputs, the output margin and the floor of noise."""
+"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, centroids; beside baselines."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ if TYPE_CHECKING:
 
 
 def probes(results: Results) -> list[PrintedTable]:
-    """Return probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
-    layer that is chosen without the target's labels."""
+    """Return probes between datasets: best layers, Cf->Cf, means by type, layers without the target's labels."""
     pairs = _pairs(results)
     tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
     return [*tables, _layers(results), _catch(results)]
@@ -76,8 +74,7 @@ BASELINES = {
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target,
-    and Cf->Cf at its own and at the best layer, as PAIR_FIGURES."""
+    """Return PAIR_FIGURES, a row per model and ordered pair: best and chosen layers, and Cf->Cf at both."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
