@@ -20,13 +20,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.agreement import cohen_kappa
-from traps_pipeline.judging.confabulation import (
-    TRACE_AND_OUTPUT,
-    VOID_KINDS,
-    drawn,
-    load_protocol,
-    sample_id,
-)
+from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, drawn, load_protocol, sample_id
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation

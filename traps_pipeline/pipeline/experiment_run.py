@@ -16,13 +16,7 @@ from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.machine import require_machine, wanted_parts
-from traps_pipeline.pipeline.selection import (
-    failed_checks,
-    is_nothing_to_do,
-    note_versions,
-    require_work,
-    stages_until,
-)
+from traps_pipeline.pipeline.selection import failed_checks, is_nothing_to_do, note_versions, require_work, stages_until
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import Workspace

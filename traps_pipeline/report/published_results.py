@@ -7,11 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.report.mechanism_page import (
-    published_cosines,
-    published_effects,
-    published_probes,
-)
+from traps_pipeline.report.mechanism_page import published_cosines, published_effects, published_probes
 from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Makers, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.metrics import joined_epochs

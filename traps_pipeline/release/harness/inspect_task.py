@@ -7,14 +7,7 @@ from typing import Any
 
 from inspect_ai import Task, task
 from inspect_ai.dataset import MemoryDataset, Sample
-from inspect_ai.model import (
-    ChatMessageSystem,
-    ChatMessageUser,
-    ContentImage,
-    ContentText,
-    ContentVideo,
-    GenerateConfig,
-)
+from inspect_ai.model import ChatMessageSystem, ChatMessageUser, ContentImage, ContentText, ContentVideo, GenerateConfig
 from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 

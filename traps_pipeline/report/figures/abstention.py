@@ -11,16 +11,7 @@ from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
-from traps_pipeline.report.writing import (
-    COLUMN_IN,
-    INK,
-    PAGE_IN,
-    SOFT,
-    NotRun,
-    figure_style,
-    new_figure,
-    plain,
-)
+from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:

@@ -13,15 +13,7 @@ from traps_pipeline.report.figures.label_placement import LINES, Label, merged_l
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
-from traps_pipeline.report.writing import (
-    COLUMN_IN,
-    INK,
-    PAGE_IN,
-    NotRun,
-    figure_style,
-    freeze_layout,
-    new_figure,
-)
+from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
