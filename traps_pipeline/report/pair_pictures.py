@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.arms_sheet import arms_sheets
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
-from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
+from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.report.worked_example import Example, example_figure, worked_example
 from traps_pipeline.report.writing import NotRun
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, VIDEOS

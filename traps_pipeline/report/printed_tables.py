@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
@@ -10,6 +11,7 @@ from traps_pipeline.report.tables.table_columns import DATASET, MODEL, titled
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.analyses import models_of
+from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text
 from traps_pipeline.scoring.published import as_printed
 
 if TYPE_CHECKING:
@@ -305,3 +307,18 @@ def _dose(family: str) -> PrintedTable:
 
 def _paths(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(path=rows["source"] + " → " + rows["target"])
+
+
+@cache
+def audit_table() -> PrintedTable:
+    """Return every statement that differs from what the paper's tables give, with its line and the arithmetic."""
+    findings = audit()
+    rows = findings.loc[findings["verdict"].isin([DIFFERS, DECLARED])].reset_index(drop=True)
+    columns = [
+        Column("line", "Line"), Column("group", "Group"), Column("statement", "Statement"),
+        Column("published", "Published"), Column("recomputed", "Recomputed, or elsewhere"),
+        Column("verdict", "Verdict"), Column("reason", "Why"),
+    ]  # fmt: skip
+    return PrintedTable(
+        "audit", "Statements that the paper’s tables do not give", rows, columns, [counts_text(findings)]
+    )

@@ -25,9 +25,9 @@ from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, 
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.pair_pictures import PairPictures
+from traps_pipeline.report.printed_tables import audit_table
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_findings import study_findings
-from traps_pipeline.report.tables.audited import audit_table
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.terms import INSIDE_TERMS
 from traps_pipeline.report.writing import NotRun, environment, figure_files, table_files

@@ -1,13 +1,14 @@
 """The explorer: a folder that opens from disk or from any web host, on which people find and look at answers.
 
-`index.html` has one classic script; all data are script files (`scripts`), clips have relative paths. The page makes no
-request that leaves the folder: its content policy forbids it. Figures come from the study's tables; the page counts
-decisions and computes no metric.
+`index.html` has one classic script; all data are script files, which a page that was opened from disk may load where it
+may not fetch; clips have relative paths. No request leaves the folder: the content policy forbids it. Figures come from
+the study's tables; the page counts decisions and computes no metric.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -17,6 +18,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
@@ -28,7 +32,6 @@ from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.explorer.scripts import data_script, parquet_text
 from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import said_by_people
@@ -55,6 +58,7 @@ _ITEM_COLUMNS = (
     *("dataset", "scenario_id", "pair_id", "side", "category", "family", "sub_scenario", "question", "ground_truth"),
     *("control_answer", "answer_type", "clip"),
 )
+_PAGE_BYTES = 1 << 24  # a column of a shard is one page, since what repeats in it is then stored once
 _PUBLISHED = ("acc", "abs_rec", "false_abs", "pecs")
 
 
@@ -299,3 +303,24 @@ def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: 
         title=f"{load_release().name}: {workspace.study.name}", version=stamp, style=style, style_digest=digest,
         script=SCRIPT, data=DATA, clips_at=clips_at, report=REPORT if report else "",
     )  # fmt: skip
+
+
+def parquet_text(table: pa.Table, level: int = 9) -> str:
+    """Return a table as a Parquet file (zstd) in base64."""
+    stream = io.BytesIO()
+    pq.write_table(
+        table.replace_schema_metadata(None), stream, compression="zstd", compression_level=level,
+        data_page_size=_PAGE_BYTES, dictionary_pagesize_limit=_PAGE_BYTES, row_group_size=max(len(table), 1),
+        write_statistics=False, store_schema=False,
+    )  # fmt: skip
+    return b64encode(stream.getvalue()).decode("ascii")
+
+
+def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
+    """Return the script of one data file, which calls the page's `TRAPS_DATA`.
+
+    version: of the whole site, as a page must not mix files of two. content: JSON values; Parquet is `parquet_text`.
+    """
+    # "<" cannot close a script element, should a host inline the file; JSON knows the escape.
+    body = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f"TRAPS_DATA({json.dumps(name)},{json.dumps(version)},{body});\n".encode()
