@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.benchmark.shortcuts import shortcuts
-from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
+from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.report.writing import figure_bytes
 from traps_pipeline.video.encode import encode
 

@@ -9,12 +9,11 @@ import pandas as pd
 
 from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.protocol.datasets import ARMS, sides_of
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import METRICS
-from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 Rows = Callable[..., pd.DataFrame]
@@ -47,5 +46,5 @@ def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:
             ]  # fmt: skip
             tables.write(VOTES, where, cast, {})
         tables.write(
-            METRICS, {"dataset": dataset}, cell_metrics(current(workspace, VERDICTS, dataset=str(dataset))), {}
+            METRICS, {"dataset": dataset}, cell_metrics(current_rows(workspace, VERDICTS, dataset=str(dataset))), {}
         )

@@ -30,11 +30,11 @@ import json
 import traps_pipeline.definitions
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.pipeline.wanted import Wanted
+from traps_pipeline.pipeline.wanted import StudyPartitions
 w = Workspace.open()
 found, stages = Lineage(w), Lineage(w).graph.stages
 print(json.dumps({
-    "versions": {f"{s.name}/{k}": found.version(s.name, k) for s in stages for k in s.wanted(Wanted(w))},
+    "versions": {f"{s.name}/{k}": found.version(s.name, k) for s in stages for k in s.wanted(StudyPartitions(w))},
     "whole": [s.name for s in stages if s.scheme is None and s.table is not None],
 }))
 """

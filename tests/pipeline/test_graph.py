@@ -126,4 +126,4 @@ def test_each_asset_shows_the_sensors_that_make_it_again() -> None:
 
 def test_a_group_that_no_job_makes_is_refused_where_it_is_declared() -> None:
     with pytest.raises(ValueError, match="no job makes the group extras; add it to JOB_GROUPS"):
-        declaration.stage("extra", lambda workspace, key: StageOutput({}), group="extras", parents=[])
+        declaration.stage("extra", group="extras", parents=[])(lambda workspace, key: StageOutput({}))

@@ -105,7 +105,7 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     assert told not in verify(submission, release).unchecked
     remedied(
         lambda: command("publish", "verify", path, "--key", tmp_path / "key.pub"),
-        "cli.release_commands.verify",
+        "cli.publish_commands.verify",
         again=lambda: command("publish", "verify", path),
     )
     root = tmp_path / "study"

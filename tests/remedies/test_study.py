@@ -43,9 +43,9 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     again: list[Callable[[], Any]] = [
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
         refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
-        refused(lambda: scoring_stages._make_metrics(workspace, "occlusion"), "pipeline.stages.scoring_stages"),
+        refused(lambda: scoring_stages.metrics.make(workspace, "occlusion"), "pipeline.stages.scoring_stages"),
         refused(lambda: scoring_stages._scored(workspace, "contrasts"), "pipeline.stages.scoring_stages"),
-        refused(lambda: scoring_stages._make_robust(workspace, None), "pipeline.stages.scoring_stages"),
+        refused(lambda: scoring_stages.robust.make(workspace, None), "pipeline.stages.scoring_stages"),
         refused(lambda: judging_stages._votes(workspace, "agreement"), "pipeline.stages.judging_stages"),
         refused(lambda: Annotation(workspace), "servers.annotate"),
         refused(lambda: study_items(workspace), "report.explorer.answer_shards.study_items"),

@@ -9,13 +9,13 @@ from html.parser import HTMLParser
 import pytest
 
 from tests.report.latex_tables import DATA, tables, text
-from traps_pipeline.report.catalogue import TABLES
+from traps_pipeline.report.catalogue import TABLE_REPORTS
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.writing import table_html
 from traps_pipeline.scoring.published import as_printed
 
 PAPER = json.loads(DATA.read_text(encoding="utf-8"))
-PRINTED = {table.name: table for report in TABLES for table in report.as_printed()}
+PRINTED = {table.name: table for report in TABLE_REPORTS for table in report.as_printed()}
 PLACES = as_printed("tables").set_index("label").to_dict("index")
 # The cells at the beginning of a row that name it, in the project's own words on the page; one where not listed.
 NAMES = {
@@ -74,8 +74,8 @@ def test_every_figure_of_the_papers_text_stands_on_some_card_with_its_line() -> 
 
 def test_recomputed_tables_stand_apart_from_the_printed_ones() -> None:
     paper = PublishedResults()
-    recomputed = {table.name: table for report in TABLES for table in report.tables(paper)}
-    (report,) = (report for report in TABLES if report.name == "replication_overall")
+    recomputed = {table.name: table for report in TABLE_REPORTS for table in report.tables(paper)}
+    (report,) = (report for report in TABLE_REPORTS if report.name == "replication_overall")
     assert {path.rpartition(".")[0] for path in report.files(paper)} == {
         "tables/published/replication_overall",
         "tables/recomputed/replication_overall",

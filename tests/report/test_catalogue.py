@@ -19,7 +19,7 @@ from traps_pipeline.judging.judging_rows import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish
-from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, JUDGED_STAGES, TABLE_REPORTS
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
@@ -41,12 +41,12 @@ PAPER = PublishedResults()
 
 @cache  # not as the file is imported, which every worker of a test run does
 def by_name():
-    return {table.name: table for report in TABLES for table in report.as_printed()}
+    return {table.name: table for report in TABLE_REPORTS for table in report.as_printed()}
 
 
 @cache
 def recomputed():
-    return {table.name: table for report in TABLES for table in report.tables(PAPER)}
+    return {table.name: table for report in TABLE_REPORTS for table in report.tables(PAPER)}
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def broken(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def broken_tables(broken):
-    return {table.name: table for report in TABLES for table in report.tables(broken)}
+    return {table.name: table for report in TABLE_REPORTS for table in report.tables(broken)}
 
 
 def shown(table, **values):
@@ -135,7 +135,7 @@ def test_a_model_whose_every_call_failed_is_a_row_of_dashes_and_breaks_no_page(b
 
 @pytest.mark.parametrize("name", ["pecs_landscape", "abs_rec", "visual_textual", "reasoning_arrows"])
 def test_a_model_whose_every_call_failed_breaks_no_figure(broken, name):
-    figure = next(report for report in FIGURES if report.name == name).make(broken)
+    figure = next(report for report in FIGURE_REPORTS if report.name == name).make(broken)
     assert overhang(figure) < 0.01
 
 
@@ -168,7 +168,7 @@ def test_figures_over_all_datasets_are_of_the_runs_that_have_them_all(tmp_path):
         if (cell["dataset"], cell["regime"]) == ("chaotic", "guided"):
             cell |= board_row(THINKS, "guided", "chaotic", (0.9, 0.1, 1.0), n_runs=4)
     workspace.tables.write(LEADERBOARD, {}, board_of(*rows), {})
-    tables = {table.name: table for report in TABLES for table in report.tables(StudyResults(workspace))}
+    tables = {table.name: table for report in TABLE_REPORTS for table in report.tables(StudyResults(workspace))}
     assert shown(tables["guided_uplift"], model=THINKS)["Ratio"] == "1.00"
     assert shown(tables["per_dataset"], regime="guided")["Mean"] == "0.250 ± 0.010"
     assert shown(tables["frontier"], regime="guided")["Acc %"] == "50.0 ± 1.0"
@@ -230,7 +230,7 @@ def test_every_published_table_is_well_formed_in_every_medium():
 
 
 def test_an_empty_study_says_not_run_and_never_zero(empty):
-    for report in TABLES:
+    for report in TABLE_REPORTS:
         for table in report.tables(empty):
             if table.name == "degenerate_strategies":  # expectations, which need no run
                 assert {row[-1] for row in table.cells} == {"–"}
@@ -239,7 +239,7 @@ def test_an_empty_study_says_not_run_and_never_zero(empty):
 
 
 def test_a_partial_study_says_what_is_missing(partial):
-    tables = {table.name: table for report in TABLES for table in report.tables(partial)}
+    tables = {table.name: table for report in TABLE_REPORTS for table in report.tables(partial)}
     assert [row[0] for row in tables["overall"].cells] == ["oracle"]
     by_dataset = {row[0]: row[2:] for row in tables["per_dataset"].cells}
     assert by_dataset["gemini-2.5-pro"] == ["–", "–", "0.250 ± 0.010 ‡", "–", "–"]
@@ -252,7 +252,7 @@ def test_a_partial_study_says_what_is_missing(partial):
 def test_a_study_of_the_papers_models_shows_the_published_pecs_beside_its_own(tmp_path):
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
     workspace.tables.write(LEADERBOARD, {}, board_of(board_row("gemini-3.1-pro", "guided")), {})
-    (table,) = next(report for report in TABLES if report.name == "overall").tables(StudyResults(workspace))
+    (table,) = next(report for report in TABLE_REPORTS if report.name == "overall").tables(StudyResults(workspace))
     assert table.cells[0][2] == "0.250 ± 0.010"
     assert dict(zip([c.heading for c in table.columns], table.cells[0], strict=True))["published PECS"] == "0.564"
 
@@ -264,7 +264,7 @@ def overhang(figure):
     return max(-drawn.x0, -drawn.y0, drawn.x1 - width, drawn.y1 - height)
 
 
-@pytest.mark.parametrize("report", FIGURES, ids=lambda report: report.name)
+@pytest.mark.parametrize("report", FIGURE_REPORTS, ids=lambda report: report.name)
 def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, empty):
     from matplotlib.text import Text
 
@@ -280,7 +280,7 @@ def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, emp
 
 @pytest.mark.parametrize("name", ["doubt_conversion", "confabulation"])
 def test_published_figures_are_byte_identical_on_a_second_build(name):
-    report = next(report for report in FIGURES if report.name == name)
+    report = next(report for report in FIGURE_REPORTS if report.name == name)
     first, second = (figure_files(name, report.make(PublishedResults())) for _ in range(2))
     assert first == second
 
@@ -301,7 +301,7 @@ def test_the_doubt_figure_refuses_to_mix_epochs():
 
 def test_the_report_page_depends_on_all_that_its_tables_and_figures_read():
     graph = the_graph()
-    reads = {stage for report in (*TABLES, *FIGURES) for stage in report.reads}
+    reads = {stage for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for stage in report.reads}
     assert (reads & graph.declared.keys()) | {"published", "verdicts"} <= graph.parents("report_page", None).keys()
 
 
@@ -311,27 +311,27 @@ def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
         below |= new
     not_the_panels = {"confabulation_prevalence", "human_row", "human_agreement", "panel_errors"}
     not_the_panels |= {"probes", "probe_baselines"}  # verdicts choose the items of Cf->Cf
-    reads = {stage for report in (*TABLES, *FIGURES) for stage in report.reads}
+    reads = {stage for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for stage in report.reads}
     assert (reads & below) - not_the_panels == JUDGED_STAGES
 
 
 def test_the_page_of_the_docs_names_every_table_and_figure():
     rows = re.findall(r"^\| (.+?) \|(.*)\|$", (ROOT / "docs" / "report.md").read_text(), re.MULTILINE)
-    for column, reports in enumerate((TABLES, FIGURES)):
+    for column, reports in enumerate((TABLE_REPORTS, FIGURE_REPORTS)):
         named = {name for row in rows for name in re.findall(r"\w+", row[column])}
         assert [report.name for report in reports if report.name not in named] == []
 
 
 def test_names_of_tables_and_figures_are_unique():
-    names = [table.name for report in TABLES for table in report.tables(PAPER)]
+    names = [table.name for report in TABLE_REPORTS for table in report.tables(PAPER)]
     assert len(set(names)) == len(names)
-    assert len({report.name for report in FIGURES}) == len(FIGURES)
+    assert len({report.name for report in FIGURE_REPORTS}) == len(FIGURE_REPORTS)
 
 
 def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch, capsys):
-    chosen = [next(r for r in FIGURES if r.name == "doubt_conversion")]
-    monkeypatch.setattr(publish, "FIGURES", chosen)
-    monkeypatch.setattr(publish, "TABLES", TABLES[:2])
+    chosen = [next(r for r in FIGURE_REPORTS if r.name == "doubt_conversion")]
+    monkeypatch.setattr(publish, "FIGURE_REPORTS", chosen)
+    monkeypatch.setattr(publish, "TABLE_REPORTS", TABLE_REPORTS[:2])
     assert main(["results", "export", str(tmp_path), "--workspace", str(workspace.root)]) == 0
     files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
     assert {f"tables/published/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")} <= files
@@ -349,7 +349,7 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
 def test_numbers_are_numbers_in_every_exported_file(partial):
     number = re.compile(r"[+−-]?(\d+(\.\d*)?|\.\d+)%?")
     for results in (partial, PAPER):
-        tables = [t for report in TABLES for t in (*report.as_printed(), *report.tables(results))]
+        tables = [t for report in TABLE_REPORTS for t in (*report.as_printed(), *report.tables(results))]
         for table in tables:
             words = {column.field for column in table.columns if column.unit == "text"}
             data = table.data  # of which both the Parquet and the CSV file are made

@@ -29,7 +29,7 @@ from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.cards import Sources, figure_card
-from traps_pipeline.report.catalogue import FIGURES, INSIDE
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.result_frames import Makers, Results
@@ -234,7 +234,7 @@ def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:
     (table,) = patching_table(made)
     found = [(row["Site"], row["Indirect effect"], row["Same side"]) for row in cells(table)]
     assert found == [("residual stream", "0.990 †", "0.010"), ("attention", "0.330 †", "–"), ("MLP", "0.495 †", "–")]
-    axes = next(report for report in FIGURES if report.name == "patching").make(made).axes
+    axes = next(report for report in FIGURE_REPORTS if report.name == "patching").make(made).axes
     titles = [ax.get_title(loc="left") for ax in axes if ax.get_title(loc="left")]
     assert titles == ["residual stream", "attention", "MLP"]
     assert axes[0].get_ylabel().replace("\n", " ") == "m: chaotic, into the control, 6 pairs"
@@ -248,7 +248,7 @@ def test_doses_are_in_units_of_the_class_gap() -> None:
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_a_figure_is_drawn_from_them(name: str) -> None:
-    report = next(report for report in FIGURES if report.name == name)
+    report = next(report for report in FIGURE_REPORTS if report.name == name)
     axes = report.make(Made()).axes
     assert axes and all(ax.has_data() for ax in axes)  # no panel for a dataset that was not asked
 
@@ -272,7 +272,7 @@ FINDINGS = {
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_a_lead_figure_says_what_it_shows_of_the_study_and_nothing_of_an_empty_one(name: str) -> None:
-    report = next(report for report in FIGURES if report.name == name)
+    report = next(report for report in FIGURE_REPORTS if report.name == name)
     assert report.finding(Made()) == FINDINGS[name]
     assert report.note(Results()) == report.doc
 
@@ -286,7 +286,7 @@ def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_i
         workspace = Workspace.create(tmp_path / f"{mechanism is None}", Study(mechanism=mechanism))
         return [part.name for part in publish.report_parts(Sources(workspace)) if part.chapter == "figures"]
 
-    order = [report.name for report in FIGURES]
+    order = [report.name for report in FIGURE_REPORTS]
     assert shown(None) == order and order[: len(INSIDE)] != [*INSIDE]
     inside = shown(MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}))
     assert inside[:3] == ["states_and_output", "lens", "probe_baselines"] == [*INSIDE[:3]]
@@ -311,7 +311,7 @@ def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no
 def test_figures_say_from_how_many_items_they_are_and_how_a_direction_ranks() -> None:
     made = Made()
     made.made["prompted_probes"] = probes().assign(n_voids=9)
-    axes = {report.name: report.make(made).axes[0] for report in FIGURES if report.name in INSIDE}
+    axes = {report.name: report.make(made).axes[0] for report in FIGURE_REPORTS if report.name in INSIDE}
     assert axes["probe_baselines"].get_title(loc="left") == "m, 9 to 16 items a side"
     assert [label.get_text() for label in axes["probe_baselines"].get_xticklabels()] == ["ch †", "ch→oc †"]
     title = axes["doses_among_nulls"].get_title(loc="left")
@@ -324,7 +324,7 @@ def test_titles_of_neighbours_do_not_overlap() -> None:
     ranks = [nulls().assign(target=name, regime="standard", null=null, side=side)
              for name, null, side in product(DATASETS, NULLS, ("control", "void"))]  # fmt: skip
     made.made["own_effects"], made.made["nulls"] = own_effects(pd.concat(of)), pd.concat(ranks)
-    figure = next(report for report in FIGURES if report.name == "doses_among_nulls").make(made)
+    figure = next(report for report in FIGURE_REPORTS if report.name == "doses_among_nulls").make(made)
     figure.draw_without_rendering()
     boxes = [ax._left_title.get_window_extent() for ax in figure.axes]
     assert len(boxes) == 4 and all("p − .05 .05 .05" in ax.get_title(loc="left") for ax in figure.axes)
@@ -336,7 +336,7 @@ def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> No
     made = Made()
     made.made["own_effects"] = own_effects(effects().assign(alpha=lambda rows: rows["alpha"].replace(200.0, 0.5)))
     assert max(made.own_effects["gaps"]) == pytest.approx(20.0)
-    (axes,) = next(report for report in FIGURES if report.name == "doses_among_nulls").make(made).axes
+    (axes,) = next(report for report in FIGURE_REPORTS if report.name == "doses_among_nulls").make(made).axes
     assert axes.get_xlim()[1] < 2.5
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "1", "+", "−"]
 
@@ -345,7 +345,7 @@ def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> No
 def test_that_figures_are_not_comparable_is_said_beside_the_legend(name: str) -> None:
     made = Made()
     made.judged_by = "Judged by rules, not comparable: pocket."
-    figure = next(report for report in FIGURES if report.name == name).figure(made)
+    figure = next(report for report in FIGURE_REPORTS if report.name == name).figure(made)
     figure.draw_without_rendering()
     (said,) = [text for text in figure.texts if "not comparable" in text.get_text()]
     others = [figure.legends[0].get_window_extent(), *(axes.get_tightbbox() for axes in figure.axes)]
@@ -353,7 +353,7 @@ def test_that_figures_are_not_comparable_is_said_beside_the_legend(name: str) ->
 
 
 def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
-    plane = next(report for report in FIGURES if report.name == "gate_arrows").make(Made()).axes[0]
+    plane = next(report for report in FIGURE_REPORTS if report.name == "gate_arrows").make(Made()).axes[0]
     assert plane.get_xlabel().startswith("J =") and plane.get_ylabel().startswith("Acc")
     points = {(round(x, 6), round(y, 6)) for marks in plane.collections for x, y in np.asarray(marks.get_offsets())}
     assert points >= {(0.5, 0.9), (0.8, 0.8)}  # J = 0.5 - 0 before the gate, 0.9 - 0.1 behind it
@@ -361,7 +361,7 @@ def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
 
 
 def test_the_page_says_below_a_figures_title_what_it_shows(tmp_path: Path) -> None:
-    report = next(report for report in FIGURES if report.name == "patching")
+    report = next(report for report in FIGURE_REPORTS if report.name == "patching")
     sources = Sources(Workspace.create(tmp_path / "study", Study()))
     assert figure_card(report, sources).why == "the experiment asks for no `patching`"
     sources.study = Made()

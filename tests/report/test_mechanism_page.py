@@ -11,7 +11,7 @@ from tests.conftest import ROOT
 from traps_pipeline.models.registry import ModelEntry, load_accounts
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.stages.mechanism_stages import GROUP
-from traps_pipeline.report.catalogue import TABLES
+from traps_pipeline.report.catalogue import TABLE_REPORTS
 from traps_pipeline.report.published_results import PublishedResults
 
 PAGE = (ROOT / "docs" / "mechanism.md").read_text()
@@ -21,7 +21,7 @@ SECTION = PAGE.split("## What each table can and cannot show")[1].split("\n## ")
 def of_mechanism() -> list[str]:
     """The names of all tables that read a stage of the mechanism group."""
     inside = {stage.name for stage in the_graph().stages if stage.group == GROUP}
-    reports = [report for report in TABLES if set(report.reads) & inside]
+    reports = [report for report in TABLE_REPORTS if set(report.reads) & inside]
     return [table.name for report in reports for table in report.make(PublishedResults())]
 
 

@@ -26,10 +26,10 @@ MODELS = {"oracle": (True, False, True), "prior": (True, True, False)}
 
 def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
     """Every table of figures over the pairs, and every frame that tables and figures of the report are made from."""
-    made: dict[str, StageOutput] = {"contrasts": scoring_stages._make_contrasts(workspace, None)}
+    made: dict[str, StageOutput] = {"contrasts": scoring_stages.contrasts.make(workspace, None)}
     workspace.tables.write(CONTRASTS, {}, made["contrasts"].frame, {})
-    made["regime_tests"] = scoring_stages._make_regime_tests(workspace, None)
-    made["leaderboard"] = scoring_stages._make_leaderboard(workspace, None)
+    made["regime_tests"] = scoring_stages.regime_tests.make(workspace, None)
+    made["leaderboard"] = scoring_stages.leaderboard.make(workspace, None)
     votes = judging_stages._votes(workspace, "agreement")
     study = StudyResults(workspace)
     frames = {name: getattr(study, name) for name in ("metrics", "sub_cells", "sub_scenarios", "labels", "composition")}

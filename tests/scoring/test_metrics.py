@@ -8,7 +8,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, cell_metrics, wrong_figures
+from traps_pipeline.scoring.metrics import BOUNDS, CELL_FIGURES, cell_metrics, wrong_figures
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.parquet import TableStore
 
@@ -27,7 +27,7 @@ def test_figures_follow_their_definitions(rows):
     cell = one(cell_metrics(rows(pairs)), scope="all")
     assert (cell.n_pairs, cell.n_missing) == (5, 0)
     # J = 0.6 - 0.2 = 0.4; PECS = 0.8 x 0.4 = 0.32; Naive = 0.8 x 0.6 = 0.48
-    assert cell[FIGURES].astype(float).to_numpy() == pytest.approx([0.8, 0.6, 0.2, 0.4, 0.32, 0.48])
+    assert cell[CELL_FIGURES].astype(float).to_numpy() == pytest.approx([0.8, 0.6, 0.2, 0.4, 0.32, 0.48])
     assert (cell.epoch, cell.benchmark_version) == ("e1", "v1")
 
 
@@ -199,7 +199,7 @@ def test_rows_fit_the_tables_schema_and_survive_a_round_trip(rows, tmp_path):
     store.write(METRICS, {"dataset": "occlusion"}, metrics, {})
     again = store.read_all(METRICS).set_index("scope")
     before = metrics.set_index("scope").loc[again.index]
-    assert np.array_equal(again[FIGURES].to_numpy(float), before[FIGURES].to_numpy(float), equal_nan=True)
+    assert np.array_equal(again[CELL_FIGURES].to_numpy(float), before[CELL_FIGURES].to_numpy(float), equal_nan=True)
     assert again["n_missing"].to_dict()["all"] == 3
 
 

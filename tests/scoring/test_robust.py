@@ -213,10 +213,10 @@ def test_the_stage_writes_a_table_with_arms_and_an_empty_one_without(
     rows: Rows, tmp_path: Path, arms: dict[str, Pairs]
 ) -> None:
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
-    with raises(TrapsError, "pipeline.stages.scoring_stages._make_robust"):
-        scoring_stages._make_robust(workspace, None)
+    with raises(TrapsError, "pipeline.stages.scoring_stages.robust"):
+        scoring_stages.robust.make(workspace, None)
     write(workspace, study(rows, [RIGHT], arms))
-    made = scoring_stages._make_robust(workspace, None)
-    assert scoring_stages._wrong_robust(workspace, None, made) == ""
+    made = scoring_stages.robust.make(workspace, None)
+    assert scoring_stages.robust.checks[0].wrong(workspace, None, made) == ""
     workspace.tables.write(ROBUST, {}, made.frame, {})
     assert [list(row.arms) for row in workspace.tables.read(ROBUST, {}).itertuples()] == ([list(arms)] if arms else [])

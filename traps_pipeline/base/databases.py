@@ -18,10 +18,7 @@ _SERVER = r"connection to server|could not translate host name|server closed the
 
 
 def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
-    """Return why a database cannot be used, what a person can do, and whether it is a file that cannot be written.
-
-    error: a driver's error, or SQLAlchemy's, which holds the driver's.
-    """
+    """Return why a database cannot be used (its driver's or SQLAlchemy's error), a remedy, and if it is unwritable."""
     words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MOST_WORDS]
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):

@@ -6,10 +6,7 @@ from traps_pipeline.base.redaction import redact
 
 
 class TrapsError(Exception):
-    """Bad input or a broken file: the message names the file and the record, and says what to do.
-
-    Keys are removed from it: it may quote a library, a provider or a file.
-    """
+    """Bad input or a broken file: the message names file and record, says what to do, and holds no key."""
 
     def __init__(self, message: object) -> None:
         super().__init__(redact(str(message)))

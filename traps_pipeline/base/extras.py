@@ -43,8 +43,7 @@ def missing(name: ExtraName, *modules: str) -> list[str]:
 
 
 def require(name: ExtraName, *modules: str) -> None:
-    """Raise TrapsError with the line to type unless an extra (or these modules of it) is installed. Call it before the
-    first import of it."""
+    """Raise TrapsError with the line to type unless an extra is installed. Call it before its first import."""
     if absent := missing(name, *modules):
         raise TrapsError(_sentence(name, absent))
 

@@ -83,9 +83,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_in_place(descriptor: int, path: Path) -> bool:
-    """Return whether an open file is still what its name stands for: a lock on one that was removed keeps nobody
-    out.
-    """
+    """Return whether an open file still has its name: a lock on one that was removed keeps nobody out."""
     try:
         current, own = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
@@ -145,8 +143,7 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 
 def link(existing: Path, path: Path) -> None:
-    """Give a file another name, in the place of what has it. Nobody writes into a file that has a name: they are
-    replaced as a whole."""
+    """Give a file another name, in the place of what has it: files that have a name are replaced as a whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:

@@ -33,9 +33,7 @@ def user_cache() -> Path:
 
 
 def require_root() -> Path:
-    """Return the folder that holds `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is
-    missing.
-    """
+    """Return the folder of `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is missing."""
     for folder in (ASSETS, SCENE_SPECS):
         if not folder.is_dir():
             raise TrapsError(

@@ -55,8 +55,7 @@ def split(wait_s: float) -> int | None:
 
 
 def wait_for(children: Collection[int]) -> tuple[int, int]:
-    """Wait until one of these children ends; returns its process id and exit code (negative: killed by that signal).
-    Adopted orphans that end meanwhile are reaped."""
+    """Return process id and exit code (negative: a signal's) of the first child to end; orphans are reaped."""
     while True:
         pid, status = os.wait()
         if pid in children:

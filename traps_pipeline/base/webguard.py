@@ -67,8 +67,7 @@ def token_for(host: str, given: str | None, *, danger: str, variable: str) -> st
 
 
 def public_name(address: str) -> str:
-    """Return the name, with a port where it has one, of the address of a server with HTTPS that stands before this one.
-    Raises TrapsError for anything else than `https://NAME[:PORT]`."""
+    """Return name (and port) of the HTTPS server before this one. Raises TrapsError unless `https://NAME[:PORT]`."""
     parts = urlsplit(address)
     if parts.scheme != "https" or not parts.hostname or address.rstrip("/") != f"https://{parts.netloc}":
         raise TrapsError(
@@ -78,8 +77,7 @@ def public_name(address: str) -> str:
 
 
 def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
-    """Return a token of each person, made from one secret: it stays the same after a restart, and tells nothing of
-    another."""
+    """Return a token of each person, made from one secret: the same after a restart, and telling nothing of another."""
 
     def own(who: str) -> str:
         return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
@@ -172,8 +170,7 @@ class Guard:
         return owner
 
     def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
-        """Whose browser it is that was let in before, or whose token a program brings as `Authorization: Bearer TOKEN`;
-        None where it is nobody's."""
+        """Return whose cookie or `Authorization: Bearer TOKEN` a request brings; None where it is nobody's."""
         scheme, _, given = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
         if scheme.lower() == "bearer":
             return self._owner(given.strip())

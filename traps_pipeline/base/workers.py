@@ -40,8 +40,7 @@ _idle: list[_Pool] | None = None  # of `kept_workers`, what nobody uses now
 
 @contextmanager
 def kept_workers() -> Iterator[None]:
-    """Within, workers that one `run_in_order` has started do the next one's jobs, too. To start one takes as long as to
-    draw some twenty frames."""
+    """Keep workers for the next `run_in_order` in the block: to start one takes as long as to draw twenty frames."""
     global _idle
     if _idle is not None:
         yield

@@ -137,8 +137,7 @@ def _said(error: Exception) -> str:
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError, also for
-    JSON that readers would take for different things."""
+    """Yield the filled lines of a JSON Lines file, numbered from 1. Raises TrapsError, also for ambiguous JSON."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
@@ -186,8 +185,7 @@ def _finite(text: str) -> float:
 
 
 def _depth(line: str) -> int:
-    """Return how deep brackets are nested at most; those inside strings do not count. Every command reads some
-    megabytes."""
+    """Return how deep brackets outside strings are nested; fast, since every command reads some megabytes."""
     outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
     brackets = outside.encode().translate(None, _NO_BRACKETS)
     return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
@@ -207,9 +205,7 @@ def parse_yaml_model(
 
 
 def _other_kinds(data: Any, made: Any, name: str = "") -> Iterator[str]:
-    """Yield values that a model took for another kind than they are: true for 1, a text for a number; and no
-    numbers.
-    """
+    """Yield values that a model took for another kind: true for 1, a text for a number; and no numbers."""
     if isinstance(made, float) and not math.isfinite(made):
         yield f"{name}: {made} is no finite number"
     number = isinstance(made, int | float) and not isinstance(made, bool)
@@ -228,10 +224,7 @@ def _other_kinds(data: Any, made: Any, name: str = "") -> Iterator[str]:
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Return a validation error in one line: field and complaint, `; ` between them.
-
-    model: what was validated; an unknown field is then told with the known one that it resembles.
-    """
+    """Return a validation error in one line, `field: complaint`, with the known field that an unknown one resembles."""
     parts = list[str]()
     for each in error.errors():
         field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")

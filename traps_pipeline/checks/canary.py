@@ -58,8 +58,7 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return the items of the canary: of each dataset of the pairs those with the smallest digests, so that they stay
-    the same while the benchmark does. Raises TrapsError where no items are made."""
+    """Return the canary's items, of each dataset those with the smallest digests. Raises TrapsError without items."""
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
@@ -78,8 +77,7 @@ class _Asked(Call):
 
 
 def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
-    """Return CANARY rows of all epochs, after asking these models over the network what they were not asked in the
-    study's epoch; the table is written. Raises what asking raises."""
+    """Return CANARY rows of all epochs, after asking these models what this epoch lacks; the table is written."""
     epoch, items = workspace.study.epoch, canary_items(workspace)
     entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
     calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]

@@ -42,11 +42,11 @@ class Finding:
 def examine(place: Place) -> Iterator[Finding]:
     """Yield one finding for each requirement of the demo."""
     for what, look in (
-        ("python", _python),
+        ("python", lambda: sys.version.split()[0]),
         ("checkout", _checkout),
         ("rendering", draw_frame),
         ("encoding", encode_clip),
-        ("disk", lambda: _disk(scratch_of(place) if isinstance(place, str) else place)),
+        ("disk", lambda: check_disk(scratch_of(place) if isinstance(place, str) else place, MIN_FREE_GB)),
         ("clip cache", _clip_cache),
         ("workspace", lambda: _workspace(place)),
         ("keys", _keys),
@@ -56,9 +56,7 @@ def examine(place: Place) -> Iterator[Finding]:
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield one finding for each requirement of local models: the three families on tiny checkpoints, devices and
-    weights, and what looking into a model takes for granted, of those and of the models of the registry that are named.
-    """
+    """Yield a finding for each requirement of local models: tiny checkpoints, devices, weights, named models."""
     from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
@@ -103,6 +101,8 @@ def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
 
 def examine_files(place: Place) -> Iterator[Finding]:
     """Yield every file of a study that says what it must hold, read whole: one finding for each kind."""
+    from traps_pipeline.mechanism.hidden_states import damage
+    from traps_pipeline.storage.parquet import altered
     from traps_pipeline.storage.workspace import Workspace
 
     workspace = Workspace.open(place)
@@ -118,14 +118,10 @@ def examine_files(place: Place) -> Iterator[Finding]:
     if workspace.is_shared:
         yield Finding(not missing, "store", "; ".join(missing[:SHOWN]) or "every object is what was written")
     for what, files, damage_of in (
-        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
+        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
         ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
-        (
-            "states",
-            sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)),
-            _damaged_states,
-        ),
+        ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
     ):
         damaged = [message for path in files if (message := damage_of(path))]
@@ -137,9 +133,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return the objects in a study's store that nobody names and that are older than the grace period, and which of
-    them were removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be
-    used."""
+    """Return the old objects in a study's store that nobody names, and whether they were removed. Raises TrapsError."""
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
@@ -158,12 +152,6 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
     return Finding(
         True, "unused", f"{done}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {what}"
     )
-
-
-def _damaged_table(path: Path) -> str:
-    from traps_pipeline.storage.parquet import altered
-
-    return altered(path)
 
 
 def _damaged_clip(path: Path) -> str:
@@ -187,12 +175,6 @@ def _damaged_media(note: Path) -> str:
     except (DamagedClip, ValueError) as error:
         return str(error)
     return ""
-
-
-def _damaged_states(path: Path) -> str:
-    from traps_pipeline.mechanism.hidden_states import damage
-
-    return damage(path)
 
 
 def _damaged_history(path: Path) -> str:
@@ -221,10 +203,6 @@ def _finding(what: str, look: Callable[[], str]) -> Finding:
         return Finding(False, what, f"{error}")
 
 
-def _python() -> str:
-    return sys.version.split()[0]
-
-
 def _checkout() -> str:
     from traps_pipeline.base.paths import require_root
     from traps_pipeline.benchmark.corrections import read_corrections
@@ -234,10 +212,6 @@ def _checkout() -> str:
     root, release = require_root(), load_release()
     counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
     return f"{root}: {release.name} {release.version}, {counts}"
-
-
-def _disk(root: Path) -> str:
-    return check_disk(root, MIN_FREE_GB)
 
 
 def _clip_cache() -> str:
@@ -257,8 +231,7 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """Return the keys that are not set, and the models and judges that need them. The demo needs no key. Raises
-    TrapsError for one that no header can carry."""
+    """Return the keys that are not set, and who needs them. Raises TrapsError for one that no header can carry."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 

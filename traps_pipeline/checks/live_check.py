@@ -13,33 +13,28 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network, is_loopback
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.checks.wire_check import Studio, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import check_money
 from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.models.participants import Row
-from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import degenerate, read_answer
-from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of, effective_params
+from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of
 from traps_pipeline.models.request import MALFORMED, UNFINISHED, WITH_TEXT, Outcome, Request, TransientError
 from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.storage.media import Media, MediaSpec, MediaStore
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.video.encode import encode
 
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
 TIMEOUT_S, REACH_S = 25.0, 5.0  # of a call, of what is looked at before: what is wrong is named within half a minute
@@ -75,17 +70,9 @@ class Live:
 
 
 @cache
-def _studio() -> tuple[TemporaryDirectory[str], Path, MediaStore]:
-    folder = TemporaryDirectory(prefix="traps-live-")
-    clip = Path(folder.name) / "clip.mp4"
+def _studio() -> Studio:
     halves = [np.full((*_SIZE, 3), colour, np.uint8) for colour in COLOURS.values()]
-    encode([halves[2 * k // _FRAMES] for k in range(_FRAMES)], clip, _FPS)
-    return folder, clip, MediaStore(Path(folder.name) / "media")
-
-
-def _clip(spec: MediaSpec) -> Media:
-    _, clip, store = _studio()
-    return store.prepare(clip, file_digest(clip), spec)
+    return Studio([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
@@ -101,31 +88,17 @@ def requests_of(entry: Entry) -> dict[str, Request]:
         }
         return {name: replace(one, about={**one.about, "check": name, "at": now}) for name, one in requests.items()}
     assert isinstance(entry, ModelEntry)
-    sent = _clip(entry.media) if entry.media else None
+    sent = _studio().prepare(entry.media) if entry.media else None
     forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
     if entry.json_schema:
         forms["schema"] = ("json", sent)
     return {
-        name: Request(
-            participant=entry.id,
-            endpoint=entry.endpoint,
-            params=effective_params(entry, regime),
-            system=system_prompt(regime),
-            user=QUESTION,
-            about={"check": name, "at": now},
-            sent=media,
-            media_digest=media.sha256 if media else "",
-        )
+        name: question(entry, regime, QUESTION, media, {"check": name, "at": now})
         for name, (regime, media) in forms.items()
     }
 
 
 # --- what is wrong ----------------------------------------------------------------------------------------------------
-
-
-def served_name(entry: Entry) -> str:
-    """Return the name that a model has at its provider."""
-    return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
 
 
 @dataclass(frozen=True)
@@ -161,8 +134,8 @@ def reach(entry: Entry, account: Account) -> Reached:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
         return Reached(refused=f"{even}: is the one in {account.key} right?")
     known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
-    if known and served_name(entry) not in known:
-        unlisted = f"{account.base_url} serves no {served_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
+    if known and model_name(entry) not in known:
+        unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
         return Reached(unlisted=unlisted)
     return Reached()
 
@@ -193,7 +166,7 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
     """Return what the outcomes of `requests_of` say of an entry, and what was found before them."""
     problems, notes, before = list[str](), list[str](), reached or Reached()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
-    if before.unlisted and served_name(entry) not in answering:
+    if before.unlisted and model_name(entry) not in answering:
         return Live(entry, [before.unlisted])
     if before.unlisted:
         notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
@@ -232,7 +205,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
         case "http_403_denied":
             return f"{name}: {where} refuses the call (HTTP 403), and not for its key; what it said stands above"
         case "http_404":
-            return f"{where} knows no model {served_name(entry)!r}, or has another path (is /v1 missing?)"
+            return f"{where} knows no model {model_name(entry)!r}, or has another path (is /v1 missing?)"
         case _ if error.startswith("ended_"):
             return f"{name}: its answer breaks off ({error.removeprefix('ended_')}), which the server's log explains"
         case "timeout":

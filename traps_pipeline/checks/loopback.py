@@ -46,8 +46,7 @@ _CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error
 
 @contextmanager
 def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
-    """A server on this machine: its address and the requests that reach it. Each gets the next of these answers, a
-    status and JSON, or a final 400."""
+    """Serve on this machine; yield address and requests. Each gets the next status and JSON, or a final 400."""
     caught: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -51,28 +51,23 @@ _PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
 # --- the question that is asked ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Studio:
+class Studio:
     """A clip without a scene, in a folder that exists until this process ends."""
 
-    folder: TemporaryDirectory[str]
-    clip: Path
-    media: MediaStore
+    def __init__(self, frames: Sequence[np.ndarray], fps: int) -> None:
+        self._folder = TemporaryDirectory(prefix="traps-check-")
+        self.clip = Path(self._folder.name) / "clip.mp4"
+        encode(frames, self.clip, fps)
+        self._media = MediaStore(Path(self._folder.name) / "media")
 
     def prepare(self, spec: MediaSpec) -> Media:
-        return self.media.prepare(self.clip, file_digest(self.clip), spec)
+        """Return the clip as a model is sent it."""
+        return self._media.prepare(self.clip, file_digest(self.clip), spec)
 
 
 @cache
-def _studio() -> _Studio:
-    folder = TemporaryDirectory(prefix="traps-wire-")
-    clip = Path(folder.name) / "clip.mp4"
-    encode(_frames(), clip, _CLIP_FPS)
-    return _Studio(folder, clip, MediaStore(Path(folder.name) / "media"))
-
-
-def _frames() -> list[np.ndarray]:
-    """Return the frames of a square that moves over a gradient."""
+def _studio() -> Studio:
+    """Film a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
     frames = []
@@ -80,41 +75,35 @@ def _frames() -> list[np.ndarray]:
         frame = ground.copy()
         frame[150:210, 8 * i : 8 * i + 60] = (220, 40, 40)
         frames.append(frame)
-    return frames
+    return Studio(frames, _CLIP_FPS)
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return one request of every form that a study sends to an entry: for a model by regime, for a judge by task (and
-    a label of confabulation, if the judge labels it)."""
+    """Return a request of every form that a study sends: by regime for a model, by task and label for a judge."""
     if isinstance(entry, ModelEntry):
-        return {regime: _answer_request(entry, regime) for regime in REGIMES}
+        sent = _studio().prepare(entry.media) if entry.media else None
+        return {regime: question(entry, regime, _QUESTION, sent, {"regime": regime}) for regime in REGIMES}
     assert isinstance(entry, JudgeEntry)
-    votes = {str(task): _vote_request(entry, task) for task in tasks_for("control")}
-    return votes | ({"confabulation": _label_request(entry)} if entry.id in load_protocol().judges.values() else {})
+    cell, item = Cell("occlusion", Evaluation("oracle", "standard", 1)), {"item_id": "none", "question": _QUESTION}
+    known = item | {"ground_truth": "yes"}
+    requests = {str(task): vote_request(entry, task, cell, known, "Yes.") for task in tasks_for("control")}
+    if entry.id in load_protocol().judges.values():
+        requests["confabulation"] = label_request(entry, cell, item, "Yes.", "Perhaps.")
+    return requests
 
 
-def _answer_request(entry: ModelEntry, regime: str) -> Request:
-    sent = _studio().prepare(entry.media) if entry.media else None
+def question(entry: ModelEntry, regime: str, text: str, sent: Media | None, about: Mapping[str, Any]) -> Request:
+    """Return the request by which a study asks a model a question about a clip."""
     return Request(
         participant=entry.id,
         endpoint=entry.endpoint,
         params=effective_params(entry, regime),
         system=system_prompt(regime),
-        user=_QUESTION,
-        about={"regime": regime},
+        user=text,
+        about=about,
         sent=sent,
         media_digest=sent.sha256 if sent else "",
     )
-
-
-def _label_request(entry: JudgeEntry) -> Request:
-    cell = Cell("occlusion", Evaluation("oracle", "standard", 1))
-    return label_request(entry, cell, {"item_id": "none", "question": _QUESTION}, "Yes.", "Perhaps.")
-
-
-def _vote_request(entry: JudgeEntry, task: Literal["abstention", "correctness"]) -> Request:
-    cell = Cell("occlusion", Evaluation("oracle", "standard", 1))
-    return vote_request(entry, task, cell, {"item_id": "none", "question": _QUESTION, "ground_truth": "yes"}, "Yes.")
 
 
 # --- comparing the sent with the declared request ---------------------------------------------------------------------
@@ -136,8 +125,7 @@ def _short(value: Any) -> str:
 
 
 def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
-    """Yield the problems of the turns: system prompt and question must arrive verbatim, with the clip before the
-    question and nothing else."""
+    """Yield what is wrong with the turns: prompt and question are verbatim, the clip before the question, no more."""
     roles = [role for role, _ in turns]
     if roles != ["system", "user"]:
         yield f"the turns are {roles}, not system and user"
@@ -289,8 +277,7 @@ def participants() -> dict[str, Entry]:
 
 
 def check_named(names: Sequence[str]) -> Iterator[Checked]:
-    """Check the entries with these ids; without any ids, all entries that send or show something. Raises TrapsError for
-    an unknown id."""
+    """Check the entries with these ids, or all that send or show something. Raises TrapsError for an unknown id."""
     known = participants()
     if unknown := [name for name in names if name not in known]:
         raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")

@@ -18,24 +18,19 @@ from traps_pipeline.base.files import remedy
 from traps_pipeline.base.redaction import redact_tracebacks
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
-    annotate_commands,
     benchmark_commands,
     completion_commands,
-    confabulation_commands,
     doctor_commands,
     exchange_commands,
     init_commands,
-    judges_commands,
     ledger_commands,
     models_commands,
+    people_commands,
     plan_commands,
-    release_commands,
+    publish_commands,
     results_commands,
-    review_commands,
     run_commands,
-    site_commands,
     status_commands,
-    submission_commands,
     ui_commands,
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run
@@ -65,8 +60,7 @@ needs to complete them."""
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
-    """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
-    interrupted. parser: that of another program which ends as this one does."""
+    """Run a subcommand; return 0 done, 1 failed, 2 bad usage, 4 over budget, 130 interrupted. parser: another's."""
     gc.set_threshold(50_000, 20, 20)  # imported objects stay: searching them for garbage costs half a second
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -160,16 +154,11 @@ def build_parser() -> Parser:
         ui_commands,
         exchange_commands,
         ledger_commands,
-        site_commands,
         results_commands,
         benchmark_commands,
         models_commands,
-        judges_commands,
-        review_commands,
-        annotate_commands,
-        confabulation_commands,
-        release_commands,
-        submission_commands,
+        people_commands,
+        publish_commands,
         completion_commands,
     ):
         module.add(commands)

@@ -1,28 +1,25 @@
-"""`traps benchmark certify` and `sample`: the benchmark's certificates, and fresh samples of the benchmark."""
+"""`traps benchmark`: certificates computed again, fresh samples of the benchmark, commitments to them and proofs."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import FAILED, OK, Commands, number, print_json, whole
 
-LOOKS = (
-    "floor",
-    "pale-floor",
-    "light",
-    "panel",
-    "bystanders",
-    "camera",
-    "material",
-    "size",
-)  # `scenes.parts.look.PARTS`, which takes long to import
+if TYPE_CHECKING:
+    from traps_pipeline.release.commitment import Commitment
+    from traps_pipeline.scenes.worlds.spec import SceneSpec
+
+# `scenes.parts.look.PARTS`, which takes long to import.
+LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 
 
 def add(commands: Commands) -> None:
-    """Add `traps benchmark certify` and `traps benchmark sample`."""
+    """Add the commands of benchmarks."""
     text = "compute every certificate of the released records again"
     parser = commands.add("benchmark certify", certify, text, example="--families plinko", workspace=False, json=True)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
@@ -56,6 +53,22 @@ def add(commands: Commands) -> None:
         metavar="PART",
         help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: what varies in the released benchmark)",
     )
+    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
+
+    text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
+    example = "private --out commitment.json --reveal reveal.json"
+    parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
+    parser.add_argument("benchmark", type=Path, help="a folder that `traps benchmark sample` wrote")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
+    parser.add_argument("--reveal", type=Path, required=True, metavar="FILE", help="the seed and a secret number")
+
+    text = "prove that a revealed benchmark is the one that was committed"
+    example = "commitment.json reveal.json --specs private"
+    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
+    parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
+    parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
+    parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
+    parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
 
@@ -122,3 +135,53 @@ def sample(arguments: argparse.Namespace) -> int:
         f"TRAPS_SCENE_SPECS={arguments.out} and `benchmark: {there}` in the experiment"
     )
     return OK
+
+
+def commit_benchmark(arguments: argparse.Namespace) -> int:
+    """See `traps benchmark commit --help`."""
+    from traps_pipeline.release.commitment import commit
+
+    made = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
+    print(f"{len(made.specs)} records of {made.name} {made.version} are committed in {arguments.out}: publish it")
+    print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
+    return OK
+
+
+def verify_commitment(arguments: argparse.Namespace) -> int:
+    """See `traps benchmark prove --help`."""
+    from traps_pipeline.release import commitment as sealed
+
+    published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
+    if arguments.without_drawing and not arguments.specs:
+        raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
+    problems, proven = [], []
+    specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
+    if specs is not None:
+        problems += sealed.broken_seals(published, reveal, specs)
+        proven.append(f"the records of {arguments.specs} are the committed ones")
+    if not arguments.without_drawing and not problems:
+        drawn = sealed.drawn_again(
+            published, reveal, workers=arguments.workers, report=lambda line: print(line, flush=True)
+        )
+        problems += _not_drawn(published, sealed.broken_seals(published, reveal, drawn), specs, drawn)
+        proven.append("the revealed seed draws them")
+    for problem in problems:
+        print(problem)
+    if problems:
+        raise TrapsError(f"{arguments.commitment}: is not proven; {len(problems)} things are not what was committed")
+    print(f"{len(published.specs)} records of {published.name} {published.version}: {', and '.join(proven)}")
+    if arguments.without_drawing:
+        print("not checked: whether the revealed seed draws them")
+    return OK
+
+
+def _not_drawn(
+    published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
+) -> list[str]:
+    """Return what the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
+    from traps_pipeline.release.commitment import other_arithmetic, same_scene
+
+    if problems and specs is not None and {*specs} == {*drawn} and all(same_scene(specs[i], drawn[i]) for i in specs):
+        elsewhere = other_arithmetic(published) or "another kind of CPU"
+        problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
+    return problems

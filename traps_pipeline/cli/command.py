@@ -57,9 +57,10 @@ def number(above: float, most: float) -> Callable[[str], float]:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest word for an unknown one, and knows commands of daily use without their group.
-    `commands` holds the parser of every command below it by its name, such as `study run`. short: the groups of
-    commands that can be given without one."""
+    """A parser that suggests the nearest word, and knows commands of daily use without their group (`short`).
+
+    `commands` holds the parser of every command below it by its name, such as `study run`.
+    """
 
     def __init__(self, *, short: Mapping[str, str] | None = None, **settings: Any) -> None:
         super().__init__(**settings)
@@ -134,7 +135,11 @@ class Commands:
             f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
         )
         parser = self._parsers[group].add_parser(
-            name, help=text, description=text, epilog=shown + codes, formatter_class=_Help
+            name,
+            help=text,
+            description=text,
+            epilog=shown + codes,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
@@ -146,10 +151,6 @@ class Commands:
         if json:
             parser.add_argument("--json", action="store_true", help="print the result as JSON")
         return parser
-
-
-class _Help(argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of the example and the exit codes."""
 
 
 def _show_help(arguments: argparse.Namespace) -> int:
@@ -208,9 +209,7 @@ def listening_of(
 
 
 def place_of(arguments: argparse.Namespace) -> Place:
-    """Return where the study lies that a command works in; it may not exist yet. Raises TrapsError for a wrong
-    address.
-    """
+    """Return where a command's study lies, there or not. Raises TrapsError for a wrong address."""
     from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -225,8 +224,7 @@ def open_workspace(arguments: argparse.Namespace) -> Workspace:
 
 
 def entered(workspace: Workspace) -> Workspace:
-    """Return the workspace, after it was set in the environment, so that the partition keys here and in child processes
-    are those of its study."""
+    """Return the workspace, set in the environment for the partition keys here and in child processes."""
     from traps_pipeline.models.own import forget
     from traps_pipeline.storage.workspace import VARIABLE
 

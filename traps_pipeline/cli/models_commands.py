@@ -1,15 +1,15 @@
-"""`traps models check`: whether the registry's entries send what they declare, and whether what they name answers."""
+"""`traps models`: whether entries send what they declare and answer; whether an answer can instruct a panel."""
 
 from __future__ import annotations
 
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import FAILED, OK, Commands, entered, place_of, print_json
+from traps_pipeline.cli.command import FAILED, OK, Commands, entered, open_workspace, place_of, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add `traps models check`."""
+    """Add the commands of models."""
     text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
     parser = commands.add("models check", check, text, example="mine.yaml --live", json=True)
     parser.add_argument(
@@ -23,6 +23,10 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="ask them: address, name, key, a clip, the schema, thinking, price; three short calls each, which cost",
     )
+
+    text = "give a panel answers that try to instruct their judge; makes calls to judges"
+    parser = commands.add("models test-panel", test_panel, text, example="rules", json=True)
+    parser.add_argument("panel", nargs="?", help="a panel of assets/judges.yaml (default: the study's)")
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -87,3 +91,20 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     for one in () if is_json else found:
         print(one.line, flush=True)
     return FAILED if any(one.problems for one in found) else OK
+
+
+def test_panel(arguments: argparse.Namespace) -> int:
+    """See `traps models test-panel --help`."""
+    from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
+    from traps_pipeline.models.judges import load_panel
+
+    workspace = open_workspace(arguments)
+    name = arguments.panel or workspace.study.panel
+    rows = check_panel(workspace, name, load_panel(name), load_attacks())
+    if arguments.json:
+        print_json(rows)
+        return OK
+    print(f"panel {name}: votes on {rows['attack'].nunique()} answers that try to instruct the judge")
+    print(summary(rows))
+    print("flipped: right on the plain answer, wrong under the attack; broken: no valid vote under it")
+    return OK

@@ -24,7 +24,6 @@ from traps_pipeline.cli.command import (
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.cost import Cost
     from traps_pipeline.models.forecast import Forecast
-    from traps_pipeline.pipeline.forecast_plan import Count
 
 
 def add(commands: Commands) -> None:
@@ -63,7 +62,11 @@ def plan(arguments: argparse.Namespace) -> int:
         for sum_, count in zip(total, counts, strict=True):
             sum_.add(count.wanted, count.known)
     headings = ("model", "answers", "known", "new", "votes", "known", "new")
-    print(text_table(headings, [_plan_row(name, counts) for name, counts in [*rows.items(), ("all", total)]]))
+    cells = [
+        [name, *(f"{number:,}" for count in counts for number in (count.wanted, count.known, count.new))]
+        for name, counts in [*rows.items(), ("all", total)]
+    ]
+    print(text_table(headings, cells))
     if planned.forecasts:
         _print_forecasts(planned.forecasts, planned.minutes)
     if planned.local:
@@ -75,10 +78,6 @@ def plan(arguments: argparse.Namespace) -> int:
             "calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
     return OK
-
-
-def _plan_row(name: str, counts: tuple[Count, Count]) -> list[str]:
-    return [name, *(f"{number:,}" for count in counts for number in (count.wanted, count.known, count.new))]
 
 
 def _print_precision(pairs: Mapping[str, int], models: int) -> None:

@@ -1,4 +1,4 @@
-"""`traps results audit`, `export` and `compare`: check the published tables, write results, compare studies."""
+"""`traps results`: write the explorer and all results, check the published tables, compare studies."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, p
 
 def add(commands: Commands) -> None:
     """Add the commands of results."""
+    text = "write a folder to explore all answers and clips in; it opens from disk"
+    parser = commands.add("results site", site, text, example="site --without-clips")
+    parser.add_argument("folder", nargs="?", type=Path, help="default: `site` in the study's folder")
+    parser.add_argument("--without-clips", action="store_true", help="leave the clips out, for a small folder")
+
     text = "recompute published values from other published tables, and compare"
     parser = commands.add("results audit", audit_published, text, example="--all", workspace=False, json=True)
     parser.add_argument("--all", action="store_true", help="show also the statements that agree")
@@ -26,6 +31,28 @@ def add(commands: Commands) -> None:
     parser = commands.add("results compare", compare_studies, text, example=".workspaces/earlier", json=True)
     parser.add_argument("other", type=Path, help="folder of the other study, such as an earlier benchmark version")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every row to a file")
+
+
+def site(arguments: argparse.Namespace) -> int:
+    """See `traps site --help`."""
+    from traps_pipeline.report.explorer.site import INDEX, write_site
+
+    workspace = open_workspace(arguments)
+    folder = (arguments.folder or workspace.root / "site").absolute()
+    written = write_site(workspace, folder, clips=not arguments.without_clips)
+    clips = f"{written.clips} clips, {_megabytes(written.clip_bytes)}"
+    print(
+        f"{written.answers} answers with {written.votes} votes: {written.files} files, {_megabytes(written.bytes)}; "
+        + ("without clips" if arguments.without_clips else clips)
+    )
+    if written.lacking:
+        print(f"{len(written.lacking)} clips are not in the study, the first is {written.lacking[0]}")
+    print(f"next: open {folder / INDEX}")
+    return OK
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
@@ -57,12 +84,12 @@ def export_results(arguments: argparse.Namespace) -> int:
 def compare_studies(arguments: argparse.Namespace) -> int:
     """See `traps results compare --help`."""
     from traps_pipeline.judging.judging_rows import VERDICTS
-    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
+    from traps_pipeline.storage.benchmark_tables import current_rows
     from traps_pipeline.storage.workspace import Workspace
 
     studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
-    then, now = (current(study, VERDICTS) for study in studies)
+    then, now = (current_rows(study, VERDICTS) for study in studies)
     table = version_contrasts(then, now)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))

@@ -186,8 +186,7 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """Return the workspace, with the budgets of the experiment in its study; budgets on the command line replace them.
-    Raises TrapsError for a wrong amount or name."""
+    """Return the workspace with the budgets of the command, else the experiment. Raises TrapsError for a wrong one."""
     stated = {name: getattr(experiment, name) for name in MONEY}
     money: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
     if arguments.allow_unknown_prices:

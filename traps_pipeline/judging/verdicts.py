@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 
@@ -14,7 +12,6 @@ from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.ratings import (
     ABSTENTION,
     ANSWER,
@@ -26,25 +23,11 @@ from traps_pipeline.protocol.ratings import (
     ratings,
 )
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = ["dataset", "model", "regime", "run"]
 ITEM_COLUMNS = ["item_id", "scenario_id", "category", "sub_scenario", "control_answer", "benchmark_version"]
 RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
-
-
-def current(
-    workspace: Workspace, table: Table, columns: Sequence[str] | None = None, dataset: str | Sequence[str] = DATASETS
-) -> pd.DataFrame:
-    """Return the rows of a table whose items are still in the benchmark. Every count uses these: a cell that was
-    evaluated before a correction may hold others.
-
-    dataset: the datasets to read; by default the four of the pairs, so that no arm enters a figure by mistake.
-    """
-    rows = workspace.tables.read_all(table, columns, dataset=dataset)
-    current_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
-    return rows.loc[rows["item_id"].isin(current_ids)].reset_index(drop=True)
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:

@@ -43,8 +43,7 @@ Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and s
 def panel_errors(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return PANEL_ERRORS rows from HUMAN_LABELS rows, and VERDICTS rows of the panel; none where people labelled
-    nothing."""
+    """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows; none where nothing was labelled."""
     rows = []
     if _is_labelled(labels):
         drawn = _drawn(verdicts, resamples, seed)
@@ -104,8 +103,7 @@ def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Drawn:
 
 
 def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
-    """Return sensitivity and specificity of the panel on each task that people labelled, in every draw; NaN without a
-    yes, or a no, of people."""
+    """Return the panel's sensitivity and specificity by labelled task and draw; NaN without people's yes, or no."""
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
         answers = truths(labels, task).dropna(subset=["truth"])

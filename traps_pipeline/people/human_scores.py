@@ -30,9 +30,7 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_versi
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
-    """Return how many units of the study each label stands for, (labels,): its stratum's by the labels of the
-    stratum.
-    """
+    """Return how many units of the study each label stands for, (labels,): its stratum's size by its labels."""
     return (labels["stratum_size"] / labels.groupby("stratum")["stratum"].transform("size")).to_numpy(float)
 
 
@@ -73,7 +71,6 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
-    """Return each figure with its interval, as columns, from ends of which the first is what was observed: (2, names, 1
-    + resamples)."""
+    """Return each figure with its interval, as columns, from draws (2, names, 1 + resamples), the observed first."""
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
     return {name: value for of_figure in columns for name, value in of_figure.items()}

@@ -20,13 +20,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.agreement import cohen_kappa
-from traps_pipeline.judging.confabulation import (
-    TRACE_AND_OUTPUT,
-    VOID_KINDS,
-    drawn,
-    load_protocol,
-    sample_id,
-)
+from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, drawn, load_protocol, sample_id
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -104,8 +98,7 @@ def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
 
 
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
-    """Write a sheet, or labels alone (LABEL_COLUMNS), as CSV. Raises TrapsError if the file exists already, since it
-    may hold labels."""
+    """Write a sheet, or LABEL_COLUMNS alone, as CSV. Raises TrapsError if the file exists, since it may hold labels."""
     if path.exists():
         raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -115,8 +108,7 @@ def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence
 
 
 def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
-    """Return the labels of two annotators from a CSV file (LABEL_COLUMNS; others are ignored; true/false, yes/no or
-    1/0).
+    """Return two annotators' labels from a CSV file (LABEL_COLUMNS; true/false, yes/no or 1/0).
 
     known: sample ids that the judge has labelled. Raises TrapsError naming the lines and columns that are wrong.
     """
@@ -181,8 +173,7 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
-    """Return JUDGE_VALIDATION rows from a label file, which are also written to the workspace. Raises TrapsError for a
-    wrong file, and for a study without labelled failures."""
+    """Return JUDGE_VALIDATION rows from a label file, and write them. Raises TrapsError, also without failures."""
     judged = _judged(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
@@ -245,9 +236,7 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
 
 
 def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether one class has at most 2 % of either annotator's labels: kappa then says nothing about
-    agreement.
-    """
+    """Return whether one class has at most 2 % of either annotator's labels: kappa then says nothing."""
     return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
 
 

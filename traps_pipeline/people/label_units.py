@@ -21,13 +21,12 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS
-from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.people.human_label_rows import PROTOCOL_FILE
 from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 TaskName = Literal["answerability", "confabulation", "abstention", "correctness"]
@@ -82,7 +81,7 @@ def units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 def _clips(workspace: Workspace) -> pd.DataFrame:
     columns = ["item_id", "dataset", "scenario_id", "side", "item_hash", "benchmark_version"]
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS)
-    verdicts = current(workspace, VERDICTS, ["item_id", "n_valid", "unanimous"])
+    verdicts = current_rows(workspace, VERDICTS, ["item_id", "n_valid", "unanimous"])
     judged = verdicts.loc[verdicts["n_valid"] > 0]
     contested = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()
     share = items["item_id"].map(contested).fillna(0.0)
@@ -99,7 +98,7 @@ def _clips(workspace: Workspace) -> pd.DataFrame:
 def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     """Return the answers whose abstention or correctness the study's panel decided."""
     decision = "abstained" if task == "abstention" else "correct"
-    verdicts = current(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
+    verdicts = current_rows(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
     decided = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
     if decided.empty:
         return decided.assign(unit="")

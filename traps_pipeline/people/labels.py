@@ -136,8 +136,7 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
 
 
 def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, in which answers about clips are read as models' answers are: abstained, and correct on a
-    control."""
+    """Return the rows with answers about clips read as models' are: abstained, and correct on a control."""
     columns = ["item_id", "ground_truth", "answer_type", "labels", "aliases"]
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS).set_index("item_id").to_dict("index")
 

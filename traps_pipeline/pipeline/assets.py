@@ -27,9 +27,8 @@ class WorkspaceResource(dg.ConfigurableResource):
     def until_torn_down(self, events: Generator[Event, None, None]) -> Iterator[Event]:
         """Pass a step's events on, and close the step when the run ends at the latest.
 
-        Where Dagster cannot write an event down, it drops the step in the middle. Closed here, its calls in flight come
-        back and are stored, and its locks are given back; the garbage collector would close it after the threads of
-        these calls are gone, and wait for them for ever.
+        Dagster drops a step in the middle where it cannot write an event. Closed here, its calls in flight are stored
+        and its locks given back; the garbage collector would wait for ever for the threads of these calls.
         """
         self._steps.callback(events.close)
         return events

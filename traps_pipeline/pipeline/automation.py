@@ -100,8 +100,10 @@ def _stages(costs: bool) -> list[Stage]:
 
 
 def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
-    """Fail the check `current` for what Dagster does not see by itself: files that are altered or gone, and assets
-    without partitions that are not current. reported: what this process has reported before."""
+    """Fail the check `current` for altered or lost files, and assets without partitions that are not current.
+
+    reported: what this process has reported before.
+    """
     partitions, history = StudyPartitions(workspace), History(instance, the_graph())
     for stage in the_graph().stages:
         recorded = history.recorded(stage.name)

@@ -26,8 +26,7 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(BaseModel):
-    """An experiment, which `traps plan` counts and `traps run` runs. Its benchmark, scenarios, per_family and panel
-    become the study's."""
+    """What `traps plan` counts and `traps run` runs; benchmark, scenarios, per_family and panel become the study's."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name = Field(pattern=r"^[a-z0-9-]+$")
@@ -117,11 +116,9 @@ class Experiment(BaseModel):
         return Asked(**values, mechanism=self.mechanism is not None)
 
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
-        """Return the study with the panel that judges this experiment: the one that the command says, else the
-        experiment's, else an existing study's. study: None for a new one.
+        """Return the study with the panel of the command, else of the experiment, else of a study (None: new).
 
-        Raises TrapsError where none is named, where command and experiment name two, and where rules would judge
-        models that they are not made for although nobody said so.
+        Raises TrapsError for none, for two, and where rules would judge models that they are not made for unasked.
         """
         base = study or self.study
         if panel is not None and self.panel not in (None, panel):
@@ -138,8 +135,7 @@ class Experiment(BaseModel):
         return base.model_copy(update={"panel": named, "judged_by_rules": by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
-        """Raise TrapsError if an existing study has another panel or epoch than this experiment asks for, or another
-        `mechanism` section."""
+        """Raise TrapsError if an existing study has another panel, epoch or `mechanism` section than this one."""
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
@@ -151,8 +147,7 @@ class Experiment(BaseModel):
             )
 
     def cells(self) -> list[Cell]:
-        """Return all cells of the experiment, ordered first by model; a model with fewer runs has fewer cells. Raises
-        TrapsError for an unknown model."""
+        """Return all cells, by model; one with fewer runs has fewer. Raises TrapsError for an unknown model."""
         cells = []
         for model in self.models:
             available = get_model(model).runs

@@ -16,13 +16,7 @@ from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.machine import require_machine, wanted_parts
-from traps_pipeline.pipeline.selection import (
-    failed_checks,
-    is_nothing_to_do,
-    note_versions,
-    require_work,
-    stages_until,
-)
+from traps_pipeline.pipeline.selection import failed_checks, is_nothing_to_do, note_versions, require_work, stages_until
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import Workspace
@@ -120,8 +114,7 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
 
 
 def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
-    """Try the models and judges over the network, before a clip is rendered. Raises TrapsError naming all that is
-    wrong."""
+    """Try the models and judges over the network first. Raises TrapsError naming all that is wrong."""
     models = [entry for entry in participants.models if entry.backend == NETWORK]
     if not models and not participants.judges:
         return

@@ -76,8 +76,10 @@ class Plan:
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
-    """Count the calls of an experiment and forecast their cost; nothing is sent and nothing is made. study: the
-    workspace's, or the one that a new workspace would have, with the panel that judges. card: one of CARDS."""
+    """Count the calls of an experiment and forecast their cost; nothing is sent or made.
+
+    study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
+    """
     panel = load_panel(study.panel)
     calls, uncertain = _count_calls(workspace, experiment, study)
     steered = _count_steered(workspace, experiment, study)
@@ -134,8 +136,7 @@ def _local_costs(
     calls: Mapping[str, tuple[Count, Count]],
     steered: Mapping[str, tuple[Count, Count]],
 ) -> Iterator[Cost]:
-    """Yield what local models take of a card: their new answers; and, as nothing tells how much of it is known, all
-    passes of states and patches of a study that has no states of the model yet."""
+    """Yield what local models take of a card: new answers, and all passes of states and patches of a new model."""
     settings, scenarios = experiment.mechanism, load_scenarios(study).values()
     taxonomies = Counter(datasets_of_category(scenario.category)[0] for scenario in scenarios)
     for model in dict.fromkeys([*calls, *(settings.models if settings else ())]):
@@ -158,8 +159,7 @@ def _local_costs(
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
-    """Return calls to the confabulation judge about the experiment's models; a model that is not judged yet counts with
-    a full sample."""
+    """Return calls to the confabulation judge; a model that is not judged yet counts with a full sample."""
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
     labels, lineage = Count(), Lineage(workspace) if workspace else None
     for model in protocol.models:
@@ -212,8 +212,7 @@ def _count_calls(
 def _items(
     workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
-    """Return the items of a dataset that the next run asks, and by side the number of those that are unknown before it
-    has made them. scenes: how many scenarios the dataset has."""
+    """Return the items that the next run asks of a dataset, and by side how many are unknown before it made them."""
     unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
     if workspace is None or lineage is None or lineage.state("items", dataset) is None:
         return [], unmade
@@ -237,8 +236,7 @@ def _count_cell(
     answers: Count,
     votes: Count,
 ) -> None:
-    """Count the calls for these items of a cell: votes on answers in the ledger by their own keys, and all votes on
-    answers that are still to be asked."""
+    """Count a cell's calls: votes on known answers by their own keys, and all votes on answers still to be asked."""
     entry, folder = get_model(cell.evaluation.model), cell.evaluation.key
     keys = {  # an item without media was never asked
         item["item_id"]: answer_request(workspace, entry, item, cell.evaluation).key

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Any, Literal
@@ -36,10 +36,7 @@ GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
 
 @dataclass(frozen=True)
 class Check:
-    """A check of each partition. wrong: what is wrong with it, in words or as data; empty where it passes.
-
-    blocks: nothing is made from a partition that does not pass.
-    """
+    """A check of each partition. wrong: what is wrong, or empty; blocks: nothing is made from one that fails."""
 
     name: str
     doc: str
@@ -95,19 +92,10 @@ class ConcurrentBuild:
 
 
 @dataclass(frozen=True)
-class Collect:
-    """Makes several partitions side by side, and hands each on when it is done."""
-
-    partitions: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, StageOutput]]]
-
-
-Make = Callable[[Workspace, Any], StageOutput]  # makes one partition
-
-
-@dataclass(frozen=True)
 class Stage:
     """Something that is made: a table, or files for people (table: None).
 
+    make: returns the StageOutput of a key; of `side_by_side`, it takes several keys and yields each with its own.
     code: raise it when the formula changes, and what was made before is stale. cost: what making it takes besides
     seconds. wants: whether a study wants a key at all. lost: what is missing of the files that a partition names.
     takes: what a run of it takes of a host. shared: how several runs make a partition at once, where they may.
@@ -115,7 +103,7 @@ class Stage:
 
     name: str
     table: Table | None
-    make: Make | Collect
+    make: Callable[[Workspace, Any], Any]
     group: str
     parents: Mapping[str, Parent]
     doc: str
@@ -128,6 +116,7 @@ class Stage:
     lost: Callable[[Workspace, Any], list[str]]
     takes: RunResources = RunResources()
     shared: ConcurrentBuild | None = None
+    side_by_side: bool = False
 
     def columns(self, key: str | None) -> Mapping[str, Any]:
         """Return values of the table's partition columns for a key."""
@@ -219,8 +208,7 @@ class Graph:
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
-        """Return every partition that a partition may be made from, whether it is there or not: keys by stage or
-        source."""
+        """Return every partition that one may be made from, whether it is there or not, by stage or source."""
         scheme = self.declared[name].scheme
         if key is not None and (scheme is None or key not in scheme.known):
             return {}  # of an experiment that the study has no more

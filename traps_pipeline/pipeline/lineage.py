@@ -75,10 +75,7 @@ class Lineage:
         return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
-        """Return why a partition cannot be made, in words; empty where it can.
-
-        current: parents must also be made from what is there now, as they are where a run has just seen to them.
-        """
+        """Return why a partition cannot be made, in words; empty where it can. current: parents must be so, too."""
         stage = self.graph[name]
         for parent, keys in self.graph.parents(name, key).items():
             if self.graph.source(parent) is not None:
@@ -95,8 +92,7 @@ class Lineage:
         return ""
 
     def waits(self, name: str, key: str | None) -> bool:
-        """Return whether something above a partition is outdated itself or must be made first: it would be made twice.
-        What costs money, and can be done without, may never come and is not waited for."""
+        """Return whether something above is outdated or must be made first, but for paid things that are not needed."""
         of_stage = self.graph[name].parents
         parents = {
             parent: keys

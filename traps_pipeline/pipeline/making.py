@@ -8,7 +8,7 @@ from contextlib import closing
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.workers import kept_workers
-from traps_pipeline.pipeline.graph import Collect, ConcurrentBuild, Make, Stage
+from traps_pipeline.pipeline.graph import ConcurrentBuild, Stage
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.leases import alone
@@ -33,28 +33,27 @@ class PartitionMaker:
 
     def make(self, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
         """Make a partition for each key of `inputs`, which were looked up before anything was read."""
-        make, shared = self._stage.make, self._stage.shared
-        if isinstance(make, Collect):
-            yield from self._side_by_side(make, [*inputs])
-        elif shared is None:
+        if self._stage.side_by_side:
+            yield from self._side_by_side([*inputs])
+        elif self._stage.shared is None:
             for key in inputs:
-                yield from self._one(make, key, Tally())
+                yield from self._one(key, Tally())
         else:
-            yield from self._beside_others(make, shared, inputs)
+            yield from self._beside_others(self._stage.shared, inputs)
 
-    def _side_by_side(self, make: Collect, keys: Sequence[str | None]) -> Iterator[tuple[str | None, StageOutput]]:
+    def _side_by_side(self, keys: Sequence[str | None]) -> Iterator[tuple[str | None, StageOutput]]:
         pending = [*keys]
         try:
-            for key, output in make.partitions(self._workspace, [str(key) for key in keys]) if keys else ():
+            for key, output in self._stage.make(self._workspace, [str(key) for key in keys]) if keys else ():
                 pending.remove(key)
                 yield key, output
         except TrapsError as error:
             self.unmade |= dict.fromkeys(pending, error)
 
-    def _one(self, make: Make, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
+    def _one(self, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
         """Make one. tally: the work that was done for it before."""
         try:
-            output = make(self._workspace, key)
+            output = self._stage.make(self._workspace, key)
         except TrapsError as error:
             self.unmade[key] = error
             return
@@ -63,11 +62,8 @@ class PartitionMaker:
 
     # --- beside other runs --------------------------------------------------------------------------------------------
 
-    def _beside_others(
-        self, make: Make, shared: ConcurrentBuild, inputs: Inputs
-    ) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make files that no other run is at, then wait for theirs; who holds a partition's lease makes the partition,
-        and the others take it over."""
+    def _beside_others(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
+        """Make files that no other run is at, wait for theirs; the holder of its lease makes a partition."""
         store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
         self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
         with kept_workers():
@@ -80,12 +76,12 @@ class PartitionMaker:
                     continue
                 with closing(lease):
                     if not self._takes_over(key, inputs[key], tally):
-                        yield from self._one(make, key, tally)
+                        yield from self._one(key, tally)
             for key, tally in later.items():
                 if key not in self.unmade and self._make_files(shared, key, tally, wait=True):
                     with alone(store, f"{self._stage.name}/{key}"):
                         if not self._takes_over(key, inputs[key], tally):
-                            yield from self._one(make, key, tally)
+                            yield from self._one(key, tally)
 
     def _make_files(self, shared: ConcurrentBuild, key: str | None, tally: Tally, *, wait: bool) -> bool:
         """Make files that a partition names, add what was done to the tally, and return whether all are there."""
@@ -98,8 +94,7 @@ class PartitionMaker:
         return is_whole
 
     def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
-        """Return whether another run has made a partition of the same inputs since this step began, and has told
-        Dagster of it, so that it was checked, too."""
+        """Return whether another run has made a partition of the same inputs meanwhile, and told Dagster of it."""
         stage, lineage = self._stage, Lineage(self._workspace)
         state = lineage.state(stage.name, key)
         if state is None or lineage.made_at(stage.name, key) == self._made_at[key]:

@@ -53,10 +53,7 @@ def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) 
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
-    """Return rows without long texts by what they are: the best and worst where a table ranks, else the first.
-
-    What a model wrote is shown on the report's pages, where it is escaped.
-    """
+    """Return rows without long texts: the best and worst where a table ranks, else the first."""
     import pandas as pd
 
     content = cast(Any, output.content)

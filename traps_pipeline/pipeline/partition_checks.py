@@ -70,8 +70,7 @@ class StageChecks:
         return self._evaluate(CURRENT, key, {"not made": str(error), REACHED: isinstance(error, BudgetReached)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate once more what fails, also of partitions that this run has not seen: Dagster shows the newest result
-        of a check, and one that passes elsewhere must not hide them."""
+        """Evaluate again what fails, seen or not: Dagster shows a check's newest result alone."""
         name = self._stage.name
         for key in self._graph.keys(name):
             if key not in seen:
@@ -90,8 +89,9 @@ class StageChecks:
 
 
 def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) -> None:
-    """Raise TrapsError, or BudgetReached, for all that this run has not made or whose checks do not pass, of a stage
-    and what is above it: had the step above raised, Dagster would have made nothing below it, not even what is sound.
+    """Raise TrapsError, or BudgetReached, for all that this run has not made or that fails, up to a stage.
+
+    Had the step above raised, Dagster would have made nothing below it, not even what is sound.
     """
     above, failed = graph.above([last]), dict[tuple[str, Node], dg.AssetCheckEvaluation]()
     of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION

@@ -23,16 +23,9 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same pieces are th
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset.
+    """One part of an asset. reads: the stages and sources whose versions decide whether it is made again.
 
-    Parameters
-    ----------
-    make
-        Returns the content.
-    reads
-        The stages and sources that it is made from; it is made again when a version of one changes.
-    inputs
-        Where not whole tables matter, the part that does, as JSON; it is compared instead of versions.
+    inputs: where not whole tables matter, the part that does, as JSON; it is compared instead of versions.
     """
 
     name: str
@@ -44,10 +37,7 @@ class Piece:
 def make_pieces(
     workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]
 ) -> tuple[dict[str, bytes], list[str]]:
-    """Return the content of all pieces by name, and the names of those that were made again.
-
-    A piece is taken from the archive if its inputs and the stage's code are those that it was made from.
-    """
+    """Return the content of all pieces by name, and the names of those whose inputs or code changed: made again."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions = Lineage(workspace).inputs(stage, None)

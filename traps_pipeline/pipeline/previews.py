@@ -5,10 +5,14 @@ A `StageOutput.shown` holds plain values, texts and these.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 STUDY_URL = "/study"  # where `traps ui` serves the study's report, site and clips
 
@@ -29,8 +33,7 @@ class Records:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A file of the study that a browser opens. path: below the workspace's root, so that it is right in a copy; view:
-    the part of its address after #."""
+    """A file that a browser opens. path: below the workspace's root; view: the part of its address after #."""
 
     path: str
     view: str = ""
@@ -39,3 +42,18 @@ class StudyFile:
     def url(self) -> str:
         """Its address on the server of `traps ui`."""
         return f"{STUDY_URL}/{quote(self.path)}" + (f"#{self.view}" if self.view else "")
+
+
+def rows_shown(frame: pd.DataFrame, rows: int = 60) -> Markdown | str:
+    """Return the first rows as a Markdown table. Use it only for figures and ids, never for text that a model wrote."""
+    if frame.empty:
+        return "not run"
+    lines = [[*map(str, frame.columns)], ["---"] * len(frame.columns)]
+    lines += [[_plain(value) for value in row] for row in frame.head(rows).itertuples(index=False)]
+    return Markdown("\n".join("| " + " | ".join(line) + " |" for line in lines))
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.4g}"
+    return "" if value is None else str(value).replace("|", "\\|")

@@ -72,9 +72,11 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
-    """So many ranges, or one for each key where there are fewer, that have about as many of the keys each and none
-    twice, whatever is missing between them: a range may hold other keys. Cells of one model stay together where there
-    are fewer runs than models, since each run loads its models anew; elsewhere those of one evaluation do."""
+    """Return so many ranges, or one a key where there are fewer, with about as many keys each and none twice.
+
+    A range may hold other keys. Cells of one model stay together where runs are fewer than models, since each run loads
+    its models anew; elsewhere those of one evaluation do.
+    """
     if scheme is None or not keys:
         return [(key, key) for key in keys]
     grid = _Grid.of(scheme)
@@ -127,9 +129,10 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
 def shared_out(
     scheme: Partitioning | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
 ) -> list[Range]:
-    """Return ranges of runs that share what is to be made of each key. seconds: of work of such a run. There are so
-    many runs, of `most`, that each finds enough to do. As long as they are no more than the keys, each goes through all
-    of them; else the runs of a range go through one key, as many as its work is worth."""
+    """Return ranges of runs that share the work of each key, so many (of `most`) that each finds enough to do.
+
+    Up to the number of keys each run goes through all of them; else the runs of a range share one key.
+    """
     count = max(1, min(most, int(sum(seconds.values()) / WORTH_S)))
     if scheme is None or count <= len(keys):
         return cut(scheme, keys, 1) * count

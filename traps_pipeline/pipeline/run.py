@@ -104,8 +104,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
 
 def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
-    """Open the instance of a folder. is_captured: whether steps print into files of Dagster's, as runs on other hosts
-    must. In this process that would keep progress from the terminal, and start four processes for every step."""
+    """Open a folder's instance. is_captured: steps print into Dagster's files, as runs on other hosts must."""
     if is_captured:
         return dg.DagsterInstance.from_config(str(home))
     silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
@@ -125,7 +124,7 @@ def _alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return the stages of a block that have something to make, or stand below one that has, and the keys of these.
+    """Return a block's stages that have something to make, or stand below one that has, and the keys of these.
 
     existing: only what is there already and outdated, and waits for nothing above it.
     """
@@ -149,10 +148,7 @@ def materialize_stale(
     *,
     experiment: str | None = None,
 ) -> WalkResult:
-    """Make what is missing or stale of these stages, block by block.
-
-    experiment: only what that one of the study's wants. KeyboardInterrupt passes through.
-    """
+    """Make what is missing or stale of these stages, or of one experiment; KeyboardInterrupt passes through."""
     outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
     history, wanted = History(instance, graph), StudyPartitions(workspace, experiment)
     tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})

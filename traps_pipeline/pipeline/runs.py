@@ -42,8 +42,7 @@ class Runs(ABC):
 
     @abstractmethod
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """Return the keys, cut into ranges that are made in one run each. A range may hold other keys too, which a run
-        leaves alone, and runs may have the same one, where they share what is to be made."""
+        """Return the keys cut into ranges, one a run; runs may share one, and leave its other keys alone."""
 
     @abstractmethod
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
@@ -51,8 +50,7 @@ class Runs(ABC):
 
 
 class RunsHere(Runs):
-    """Runs in this process, of the job of all assets. parent: the run that starts them, which their tags name; log: is
-    told of each. finished: what each run was, for the parent's metadata."""
+    """Runs in this process, of the job of all assets. parent: the run that starts them; log: is told of each."""
 
     def __init__(
         self,
@@ -108,8 +106,7 @@ class RunsHere(Runs):
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
-    """Return the tags of a run of a range. A single key needs none, unless Dagster is told of it in no other way
-    (always)."""
+    """Return the tags of a run of a range; a single key needs none, unless Dagster is told no other way (always)."""
     first, last = one
     if first is None or (first == last and not always):
         return {}
@@ -136,8 +133,7 @@ def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
 
 
 def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
-    """Return whether a run, or a step of it that others wait for, ended for no reason that it could tell: its host, the
-    network or the database failed."""
+    """Return whether a run or step ended for no reason that it could tell: host, network or database failed."""
     named = [{error.cls_name for error in _causes(event)} for event in failures]
     is_interrupted = any(names & {*_INTERRUPTS} for names in named)
     unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
@@ -158,8 +154,7 @@ def _chain(error: Any) -> list[Any]:
 
 
 def reason(error: Any) -> str:
-    """Return what an error that Dagster wrote down says: our own sentences where there are some, else its innermost
-    cause."""
+    """Return what an error of Dagster's says: our own sentence if it holds one, else its innermost cause."""
     chain = _chain(error)
     readable = [one for one in chain if one.cls_name in _SENTENCES]
     if not readable:

@@ -23,8 +23,7 @@ _HISTORY = Path("history", "runs", "index.db")  # of Dagster's SQLite storage, b
 
 
 def stages_until(until: str | None) -> set[str]:
-    """Return all stages; with `until` (names with commas between), these and what they are made from. Raises
-    TrapsError."""
+    """Return all stages; with `until`, these (commas between) and what they need. Raises TrapsError."""
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
@@ -107,8 +106,7 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
-    """Return where Dagster's history lies, and the size and time of its files; None where it is no file of this
-    machine."""
+    """Return where Dagster's history lies, and size and time of its files; None where it is no file here."""
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     index = home / _HISTORY
     if workspace.is_shared or not index.is_file():

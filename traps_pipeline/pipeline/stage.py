@@ -1,11 +1,12 @@
 """The one declaration of a stage or source: what people edit, and what is made of it.
 
-`stage(...)` declares a table (or files for people), `source(...)` something that people edit. `pipeline.assets`
-makes Dagster's assets of them, and `pipeline.step` their partitions.
+`@stage(TABLE, ...)` declares that a function makes a table (or files for people), `@source(...)` that one returns the
+version of something that people edit. `pipeline.assets` makes Dagster's assets of them, `pipeline.step` their
+partitions.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from functools import cache
+from functools import cache, wraps
 from typing import Any
 
 from traps_pipeline.base.digests import digest, file_digest
@@ -14,10 +15,8 @@ from traps_pipeline.pipeline.graph import (
     DECLARED,
     GROUPS,
     Check,
-    Collect,
     ConcurrentBuild,
     Cost,
-    Make,
     Parent,
     RunResources,
     Source,
@@ -25,8 +24,10 @@ from traps_pipeline.pipeline.graph import (
     UpstreamPolicy,
 )
 from traps_pipeline.pipeline.partitioning import KeyMapping, Partitioning
+from traps_pipeline.pipeline.previews import rows_shown
 from traps_pipeline.pipeline.schemes import LEFT_OUT
 from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -56,23 +57,20 @@ def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need:
 
 
 def source(
-    name: str,
-    version: Callable[[Workspace, Any], str],
-    *,
-    group: str,
-    doc: str,
-    kinds: Sequence[str],
-    scheme: Partitioning | None = None,
-) -> Source:
-    """Declare something that people edit; its data version, by partition where it has any, is made from its content."""
-    one = Source(name, version, group, doc, kinds, scheme)
-    _declare(one)
-    return one
+    *, group: str, kinds: Sequence[str], scheme: Partitioning | None = None
+) -> Callable[[Callable[[Workspace, Any], str]], Source]:
+    """Declare something that people edit, by the function of its name that returns its data version."""
+
+    def declare(version: Callable[[Workspace, Any], str]) -> Source:
+        one = Source(version.__name__, version, group, _doc(version), kinds, scheme)
+        _declare(one)
+        return one
+
+    return declare
 
 
 def stage(
     table: Table | str,
-    make: Make | Collect,
     *,
     group: str,
     parents: Sequence[Parent | Stage | Source],
@@ -85,32 +83,56 @@ def stage(
     lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
     takes: RunResources | None = None,
     shared: ConcurrentBuild | None = None,
-) -> Stage:
-    """Declare a table, or files for people where only a name is given (see `graph.Stage` for the parameters).
+    side_by_side: bool = False,
+) -> Callable[[Callable[[Workspace, Any], Any]], Stage]:
+    """Declare what a function makes: a table, or files for people where only a name is given (see `graph.Stage`).
 
-    The description is the docstring of what makes it; the code is `code_of` the group, unless stated.
+    The description is the function's docstring; the code is `code_of` the group, unless stated. It returns a
+    StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown as well.
+    side_by_side: it gets the keys of several partitions, and yields each with its StageOutput.
     """
-    function = make.partitions if isinstance(make, Collect) else make
-    above = [one if isinstance(one, Parent) else of(one) for one in parents]
-    one = Stage(
-        name=table if isinstance(table, str) else table.name,
-        table=None if isinstance(table, str) else table,
-        make=make,
-        group=group,
-        parents={parent.name: parent for parent in above},
-        doc=" ".join((function.__doc__ or "").split()),
-        scheme=scheme,
-        checks=checks,
-        kinds=[*kinds],
-        code=code or ("1" if cost else code_of(group)),
-        cost=cost,
-        wants=wants,
-        lost=lost,
-        takes=takes or RunResources(),
-        shared=shared,
-    )
-    _declare(one)
-    return one
+
+    def declare(function: Callable[[Workspace, Any], Any]) -> Stage:
+        @wraps(function)
+        def make(workspace: Workspace, key: Any) -> StageOutput:
+            made = function(workspace, key)
+            return made if isinstance(made, StageOutput) or isinstance(table, str) else _with_preview(table, made)
+
+        above = [one if isinstance(one, Parent) else of(one) for one in parents]
+        one = Stage(
+            name=table if isinstance(table, str) else table.name,
+            table=None if isinstance(table, str) else table,
+            make=function if side_by_side else make,
+            group=group,
+            parents={parent.name: parent for parent in above},
+            doc=_doc(function),
+            scheme=scheme,
+            checks=checks,
+            kinds=[*kinds],
+            code=code or ("1" if cost else code_of(group)),
+            cost=cost,
+            wants=wants,
+            lost=lost,
+            takes=takes or RunResources(),
+            shared=shared,
+            side_by_side=side_by_side,
+        )
+        _declare(one)
+        return one
+
+    return declare
+
+
+def _with_preview(table: Table, rows: Any) -> StageOutput:
+    """Return the rows, a frame or values of the table's dataclass, as a frame whose first rows are shown."""
+    import pandas as pd
+
+    frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), columns=pd.Index(table.names))
+    return StageOutput(frame, shown={table.name: rows_shown(frame)})
+
+
+def _doc(function: Callable[..., Any]) -> str:
+    return " ".join((function.__doc__ or "").split())
 
 
 def _declare(one: Stage | Source) -> None:

@@ -44,8 +44,7 @@ _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when thi
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
-    """Make what this run is to make of a stage; yield Dagster's events. Raises TrapsError where the step cannot begin,
-    and at the end of a run for all that it has not made."""
+    """Make this run's part of a stage; yield Dagster's events. Raises TrapsError, at a run's end for all of it."""
     step = _Step(stage, context, workspace)
     yield from step.tell_unwanted()
     for key in step.to_make():
@@ -171,9 +170,10 @@ class _Step:
 
 
 def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Pass a step's events on, with its progress in Dagster's log; keep keys out of the traceback that Dagster stores,
-    and call a run that a person stopped by a signal canceled: Dagster, which did not stop it itself, would call it a
-    failure."""
+    """Pass a step's events on, with progress in Dagster's log and without keys in the traceback that it stores.
+
+    A run that a signal stopped is canceled, which Dagster, as it did not stop it itself, would call a failure.
+    """
     report = progress.current()
     try:
         with report.heard_by(context.log.info):
@@ -191,9 +191,10 @@ def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
 
 
 def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
-    """End this process where its run was resumed elsewhere since it had been resumed so many times: its host was
-    stopped and taken for dead. What it could not make another process makes, and it must not tell Dagster that the run
-    failed, which both of them are."""
+    """End this process if its run was resumed elsewhere since: its host was stopped and taken for dead.
+
+    Another process makes what it could not, and it must not tell Dagster that the run failed.
+    """
     if instance.count_resume_run_attempts(run_id) > attempts:
         os._exit(RESUMED_ELSEWHERE)
 

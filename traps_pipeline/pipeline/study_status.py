@@ -12,8 +12,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """The partitions of a stage: the number of fresh ones, the stale ones with reasons, the missing ones. A stage
-    without partitions has one, of its own name."""
+    """The partitions of a stage: number of fresh, stale with reasons, missing; one of its own name if none."""
 
     stage: str
     fresh: int

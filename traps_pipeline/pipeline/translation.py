@@ -20,9 +20,7 @@ for _category in (dg.BetaWarning, dg.PreviewWarning):
 
 
 def asset_key(name: str) -> dg.AssetKey:
-    """Return the asset key of a stage or source: its name, behind the study's where several studies share one
-    history.
-    """
+    """Return the asset key of a stage or source: its name, behind the study's where studies share one history."""
     return dg.AssetKey([*_prefix(), name])
 
 

@@ -33,8 +33,7 @@ from traps_pipeline.storage.workspace import Workspace
 class StudyPartitions:
     """The keys of every kind of partition that a study wants, in key order.
 
-    workspace: None for all that the registry has, which is what is shown where there is no study yet. experiment: the
-    name of one of the study's, whose part alone is wanted.
+    workspace: None for all that the registry has. experiment: one of the study's, whose part alone is wanted.
     """
 
     def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:

@@ -38,8 +38,10 @@ SERVED_FOLDERS = ("reports", "site", "clips")
 
 
 def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
-    """Run the web server, the daemon and the code server that both ask, until KeyboardInterrupt, then end them and all
-    that they started. Raises TrapsError when one of them ends by itself."""
+    """Run web server, daemon and their code server until KeyboardInterrupt, then end all that they started.
+
+    Raises TrapsError when one of them ends by itself.
+    """
     with tempfile.TemporaryDirectory() as folder:
         address, workspace = f"{folder}/code.sock", Path(folder) / "workspace.yaml"
         location = {"grpc_server": {"socket": address, "location_name": _MODULE}}

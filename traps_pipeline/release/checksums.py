@@ -16,9 +16,7 @@ _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
 def released_files(folder: Path) -> list[str]:
-    """Return every file below a folder that has a checksum, as a path from it, in order. Hidden files are none of
-    it.
-    """
+    """Return every file of a folder that has a checksum, by its path in it, in order; hidden files have none."""
     paths = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
     names = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
     return sorted(name for name in names if name not in _OUTSIDE)

@@ -123,8 +123,7 @@ def _read(kind: type[Any], path: Path) -> Any:
 
 
 def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
-    """Return the records of a revealed benchmark: a folder of `traps benchmark sample`, or a released folder. Raises
-    TrapsError, also for a trajectory that is not its record's."""
+    """Return the records of a sampled or released folder. Raises TrapsError, also for another trajectory."""
     from traps_pipeline.benchmark.specs import spec_of
 
     if (folder / "scenarios.jsonl").is_file():
@@ -189,9 +188,7 @@ def same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
 
 
 def other_arithmetic(commitment: Commitment) -> str:
-    """Return how this machine and its libraries differ from those of the commitment, in words; empty where they do
-    not.
-    """
+    """Return how machine and libraries differ from those of the commitment, in words; empty where they do not."""
     here = _made_with()
     names = [name for name in here if commitment.made_with.get(name) != here[name]]
     return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)

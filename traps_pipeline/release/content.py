@@ -44,8 +44,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Content:
-    """What is released: ITEMS rows, of the pairs and of arms; SCENE_SPECS rows; the clips by their path in the folder;
-    name, version and canary of the benchmark."""
+    """What is released: ITEMS rows of pairs and arms; SCENE_SPECS rows; clips by path in the folder; the benchmark."""
 
     items: Rows
     specs: Rows
@@ -59,8 +58,7 @@ class Content:
 
 
 def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
-    """Return the pairs of a study, and items of these arms. Raises TrapsError for items that are not made, for an arm
-    without items, and for a clip that is missing or not the one that its item names."""
+    """Return a study's pairs, and items of these arms. Raises TrapsError for what is not made, or a wrong clip."""
     items = _records(workspace, ITEMS, (*DATASETS, *arms))
     if not items:
         raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")

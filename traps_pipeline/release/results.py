@@ -18,13 +18,13 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.benchmark.records import Release, load_release
-from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.registry import is_reference
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.release.submission import table_bytes
 from traps_pipeline.scoring.bootstrap import RESAMPLES
 from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
@@ -37,8 +37,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Who:
-    """organization: who made the evaluation. developer: of the models that are no reference models, as the hub names
-    it."""
+    """Who made the evaluation, and who develops the models that are no reference models."""
 
     organization: str = "unknown"
     developer: str = "unknown"
@@ -62,7 +61,9 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
     overall = board.loc[(board["dataset"] == "overall") & board["pecs"].notna()]
     if overall.empty:
         raise TrapsError(f"{workspace.root}: no model has all four datasets yet; run the experiment first")
-    answers: list[dict[Any, Any]] = current(workspace, RESPONSES, ["item_id", "model", "created_at"]).to_dict("records")
+    answers: list[dict[Any, Any]] = current_rows(workspace, RESPONSES, ["item_id", "model", "created_at"]).to_dict(
+        "records"
+    )
     asked: dict[str, list[pd.Timestamp]] = {}
     for row in answers:
         asked.setdefault(row["model"], []).append(row["created_at"])

@@ -22,8 +22,7 @@ def _library() -> Any:
 
 
 def sign(folder: Path, private_key: Path) -> Path:
-    """Sign every file of a folder with a private key (PEM, elliptic curve); the signature's path. Raises TrapsError
-    where the library is missing or the key is none."""
+    """Sign a folder's files with a private elliptic key (PEM); return the signature. Raises TrapsError."""
     library, path = _library(), folder / SIGNATURE
     try:
         config = library.signing.Config().use_elliptic_key_signer(private_key=private_key)
@@ -37,8 +36,7 @@ def sign(folder: Path, private_key: Path) -> Path:
 
 
 def check_signature(folder: Path, public_key: Path) -> str:
-    """Return what is wrong with the signature of a folder, in words; empty where it is that of the key over these very
-    files. Raises TrapsError where the library or the signature is missing."""
+    """Return what is wrong with a folder's signature, or nothing. Raises TrapsError for want of library or file."""
     library, path = _library(), folder / SIGNATURE
     if not path.is_file():
         raise TrapsError(f"{path}: is missing, so that there is nothing to verify; leave --key out")

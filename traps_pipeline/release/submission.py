@@ -25,7 +25,6 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
-from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judges import RULES_VERSION, load_panel, panel_id
 from traps_pipeline.models.prompts import prompt_version
@@ -33,7 +32,7 @@ from traps_pipeline.models.reading import READING
 from traps_pipeline.models.thinking import Marks
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
-from traps_pipeline.storage.benchmark_tables import ITEMS
+from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -97,13 +96,12 @@ class Submission:
 
 
 def pack(workspace: Workspace, target: Path, name: str) -> About:
-    """Write a study's submission; the same study gives the same bytes. Raises TrapsError where it is not judged or
-    scored yet."""
+    """Write a study's submission, equal bytes for equal studies. Raises TrapsError if not judged or scored yet."""
     study = workspace.study
     frames = {
         "items.parquet": workspace.tables.read_all(ITEMS, dataset=DATASETS),
-        "responses.parquet": current(workspace, RESPONSES),
-        "votes.parquet": current(workspace, VOTES),
+        "responses.parquet": current_rows(workspace, RESPONSES),
+        "votes.parquet": current_rows(workspace, VOTES),
         "metrics.parquet": workspace.tables.read_all(METRICS, dataset=DATASETS),
         "leaderboard.parquet": workspace.tables.read_all(LEADERBOARD),
     }
@@ -160,8 +158,7 @@ def _zipped(content: Mapping[str, bytes]) -> bytes:
 
 
 def read_submission(path: Path) -> Submission:
-    """Return a submission from its file. Raises TrapsError for a file that is none: other names, too large, compressed
-    as a whole, other columns, or text where a table should be."""
+    """Return a submission. Raises TrapsError for other names or columns, too much, compression, or no table."""
     try:
         size = path.stat().st_size
         if size > MOST_FILE_BYTES:

@@ -71,8 +71,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Group:
-    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission where several submissions
-    have one of that name."""
+    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission where names repeat."""
 
     items: str
     panel: str

@@ -65,8 +65,7 @@ class Verified:
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verified:
-    """Verify a submission, against a released folder if one is given. Raises TrapsError for a release that cannot be
-    read."""
+    """Verify a submission, against a released folder if given. Raises TrapsError for a release that cannot be read."""
     verified = Verified()
     items = {row["item_id"]: row for row in _records(submission.table(ITEMS))}
     answers, votes = _records(submission.table(RESPONSES)), _records(submission.table(VOTES))
@@ -120,8 +119,7 @@ def _wrong_prompts(submission: Submission) -> Iterator[str]:
 
 
 def released_items(release: Path) -> dict[str, tuple[str, str]]:
-    """Return digests of item and clip of each item of a released folder. Raises TrapsError, also where the folder was
-    altered."""
+    """Return digests of item and clip by released item. Raises TrapsError, also for an altered folder."""
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
 
@@ -241,8 +239,7 @@ def _cast_again(request: Request) -> Outcome:
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from what it must be; an item whose truth is of another kind than it says decides
-    nothing."""
+    """Return how a vote differs from what it must be; an item of another kind than it says decides nothing."""
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:

@@ -38,11 +38,9 @@ class Row:
 
 
 def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, Figure]:
-    """Return `arms_<taxonomy>` of the scenario of each taxonomy that admits most arms (of several, the first by id),
-    and `panels_occlusion` of that which admits most looks of the panel.
+    """Return `arms_<taxonomy>` of the first scenario with most arms, and `panels_occlusion` of that with most looks.
 
-    items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No figure where nothing was filmed. Raises
-    DamagedClip when a clip cannot be decoded.
+    items: ITEMS rows of the pairs; arms: ARMS rows; clips lie under root. Raises DamagedClip.
     """
     pairs = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     figures: dict[str, Figure] = {}

@@ -37,18 +37,9 @@ Address = Callable[[Behind], str]
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page.
+    """A part of the page: the study's tables or figures (`html`, escaped), or `why` it was not run; the paper's beside.
 
-    Parameters
-    ----------
-    html
-        The study's tables or figures, escaped; empty if the part was not run.
-    why
-        Then the reason.
-    shows
-        What figures show, in words.
-    paper
-        The paper's tables or figures of the kind, escaped.
+    shows: what figures show, in words.
     """
 
     name: str
@@ -111,7 +102,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
         except NotRun:
             pictures = {}
         return Card(_name(report), report.title, _fragment("figures", pictures=pictures, alt=report.title))
-    published = {"As the paper prints it": report.as_printed()} if report.paper else {}
+    published = {"As the paper prints it": printed} if (printed := report.as_printed()) else {}
     if report.recomputed:
         published["Recomputed from the published tables"] = report.tables(sources.paper)
     tables = {words: tables_html(each, "", None) for words, each in published.items()}

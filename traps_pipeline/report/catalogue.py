@@ -1,7 +1,6 @@
-"""Every table and figure by name: the function that makes it from `Results`, and the stages it reads (docs/spec.md 10).
+"""Every table and figure by name: what makes it from `Results`, and the stages it reads (docs/spec.md 10).
 
-A new table or figure is an entry here. Its asset, staleness and place on the report page and in `traps results export`
-follow from the entry.
+Its asset, staleness and place on the report page and in `traps results export` follow from its entry.
 """
 
 from __future__ import annotations
@@ -11,12 +10,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
-from traps_pipeline.report import findings
+from traps_pipeline.report import findings, printed_tables
 from traps_pipeline.report.figures import abstention, expression_figures, grids, landscape, steering_figures
 from traps_pipeline.report.figures import control_figures as figures_of_inside
-from traps_pipeline.report.printed import printed_mechanism as printed_mechanism
-from traps_pipeline.report.printed import printed_scores as printed_scores
-from traps_pipeline.report.printed import printed_setup as printed_setup
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables import (
     comparisons,
@@ -43,20 +39,8 @@ RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the pape
 # Stages whose tables hold figures that the panel decided: what reads one of them says who judged. Tests hold this
 # against the graph.
 JUDGED_STAGES = {
-    "leaderboard",
-    "metrics",
-    "contrasts",
-    "regime_tests",
-    "hypotheses",
-    "leave_one_out",
-    "steering_effects",
-    "steering_shares",
-    "steering_nulls",
-    "steering_pecs",
-    "gate",
-    "risk_coverage",
-    "item_scores",
-    "corrected",
+    *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "leave_one_out", "item_scores", "corrected"),
+    *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs", "gate", "risk_coverage"),
 }
 
 
@@ -84,8 +68,7 @@ class TableReport:
         return self.paper is not None or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """Return the tables; of the paper, those recomputed from its numbers, without columns that have no figure. They
-        are made once for a set of results: for their own files and for the page."""
+        """Return the tables, made once; of the paper those recomputed, without columns that have no figure."""
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -99,12 +82,11 @@ class TableReport:
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's own tables."""
-        return self.paper() if self.paper else []
+        """Return the paper's own tables, and what stands only in its text."""
+        return [*(self.paper() if self.paper else []), *printed_tables.in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path: `tables/name.csv` and so on; for the paper, its tables as printed in `tables/published`
-        and what follows from them in `tables/recomputed`."""
+        """Return files by path below `tables`; of the paper below `tables/published` and `tables/recomputed`."""
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
@@ -142,69 +124,67 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure; where its numbers are not comparable it says so itself, since pictures lose their
-        captions. Raises NotRun where it has no data."""
+        """Return the figure, which says so itself where rules judged. Raises NotRun where it has no data."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
         return figure
 
 
-TABLES: tuple[TableReport, ...] = (
-    TableReport("overall", leaderboards.overall, ("leaderboard",), printed_scores.overall, recomputed=("overall",)),
+TABLE_REPORTS: tuple[TableReport, ...] = (
+    TableReport("overall", leaderboards.overall, ("leaderboard",), printed_tables.overall, recomputed=("overall",)),
     TableReport("replication_overall", leaderboards.replication_overall, ("leaderboard",),
-        printed_scores.replication_overall, recomputed=("replication_overall",)),
-    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_scores.per_dataset),
-    TableReport("expanded", leaderboards.expanded, ("leaderboard",), printed_scores.expanded,
+        printed_tables.replication_overall, recomputed=("replication_overall",)),
+    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_tables.per_dataset),
+    TableReport("expanded", leaderboards.expanded, ("leaderboard",), printed_tables.expanded,
         title="By dataset and regime"),
     TableReport("replication_per_dataset", leaderboards.replication_per_dataset, ("leaderboard",),
-        printed_scores.replication_per_dataset),
-    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts"), printed_scores.guided_uplift,
+        printed_tables.replication_per_dataset),
+    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts"),
         recomputed=("guided_uplift",)),
-    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",), printed_scores.visual_textual,
+    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",), printed_tables.visual_textual,
         recomputed=("visual_textual",)),
     TableReport("reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts"),
         recomputed=("reasoning_pairs",)),
     TableReport("frontier", comparisons.frontier, ("leaderboard",), recomputed=("frontier",)),
-    TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_scores.naive, recomputed=("pecs_naive",)),
-    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",), printed_scores.zero_boundary,
+    TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_tables.naive, recomputed=("pecs_naive",)),
+    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",),
         recomputed=("zero_boundary",)),
     TableReport("contrasts", comparisons.contrasts, ("leaderboard", "contrasts")),
     TableReport("regime_tests", comparisons.regime_tests, ("regime_tests",)),
-    TableReport("run_spread", comparisons.spreads, ("leaderboard",), printed_scores.run_spread,
-        recomputed=("run_spread",)),
-    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_scores.degenerate),
+    TableReport("run_spread", comparisons.spreads, ("leaderboard",), recomputed=("run_spread",)),
+    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_tables.degenerate),
     TableReport("occlusion_sub_scenarios", sub_scenarios.occlusion_sub_scenarios, ("metrics", "items"),
-        printed_scores.occlusion_sub_scenarios, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
+        printed_tables.occlusion_sub_scenarios, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
     TableReport("chaotic_sub_scenarios", sub_scenarios.chaotic_sub_scenarios, ("metrics", "items"),
-        printed_scores.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
+        printed_tables.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
     TableReport("hypotheses", hypothesis_tables.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
-    TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_setup.agreement),
+    TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_tables.agreement),
     TableReport("judge_bias", judge_tables.judge_bias, ("judge_bias", "leave_one_out")),
     TableReport("confabulation", judge_tables.confabulation, ("confabulation_prevalence",),
-        printed_setup.confabulation),
+        printed_tables.confabulation),
     TableReport("people", human_tables.people, ("human_row", "human_agreement"), title="People"),
     TableReport("judge_corrected", human_tables.judge_corrected, ("panel_errors", "corrected"),
         title="Corrected for judges’ errors"),
-    TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_setup.validation),
-    TableReport("probes", tables_of_probes.probes, ("probes", "probe_baselines"), printed_mechanism.probes,
+    TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_tables.validation),
+    TableReport("probes", tables_of_probes.probes, ("probes", "probe_baselines"), printed_tables.probes,
         ("probe_means",), "Probes"),
     TableReport("probe_baselines", control_reports.probe_baselines, ("probes", "probe_baselines"),
         title="Probes and their baselines"),
     TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", tables_of_patching.patching, ("patching",)),
-    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines,
+    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_tables.cosines,
         title="Void directions"),
     TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"),
-        printed_mechanism.steering, recomputed=("steering_regimes",), title="Steering"),
+        printed_tables.steering, recomputed=("steering_regimes",), title="Steering"),
     TableReport("steering_controls", control_reports.steering_nulls, ("steering_nulls", "steering_pecs"),
         title="Steering among its controls"),
-    TableReport("composition", setup_tables.composition, ("items",), printed_setup.composition),
-    TableReport("models", setup_tables.models, ("leaderboard",), printed_setup.models),
+    TableReport("composition", setup_tables.composition, ("items",), printed_tables.composition),
+    TableReport("models", setup_tables.models, ("leaderboard",), printed_tables.models),
     TableReport("hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"),
-        printed_setup.hyperparameters),
+        printed_tables.hyperparameters),
 )  # fmt: skip
-FIGURES: tuple[FigureReport, ...] = (
+FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),
     FigureReport("visual_textual", "Visual against textual voids", abstention.visual_textual, ("leaderboard",)),
     FigureReport("abs_rec", "AbsRec, standard and guided", abstention.abs_rec_by_model, ("leaderboard",)),
@@ -244,8 +224,7 @@ def folder(kind: str, results: Results) -> str:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure, or along its right edge where its layout is frozen or a legend is at the
-    foot, for which the layout leaves no second line."""
+    """Write a line at the foot of a figure, or along its right edge where its layout leaves no room there."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}

@@ -52,8 +52,7 @@ PAGE = Layout()
 
 @dataclass(frozen=True)
 class SampledClip:
-    """Frames (moments, H, W, 3) uint8 at the control's times; those with index `known` or more lie after the clip's end
-    (s)."""
+    """Frames (moments, H, W, 3) uint8 at the control's times (s); from index `known` on after the clip's end."""
 
     frames: np.ndarray
     known: int
@@ -61,10 +60,9 @@ class SampledClip:
 
 
 def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figure:
-    """For each pair, a row of control frames above a row of void frames at the same times, from start to end.
+    """Return a row of control frames above a row of void frames at the same times, for each pair of ITEMS rows.
 
-    items are ITEMS rows with both sides of each pair, and clips lie under root. Times after a truncated void's end are
-    hatched. Raises DamagedClip when a clip cannot be decoded.
+    Clips lie under root. Times after a truncated void's end are hatched. Raises DamagedClip.
     """
     pairs = whole_pairs(items)
     columns = min(layout.columns, len(pairs))
@@ -105,9 +103,7 @@ def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Return control, void and the times (moments,) in seconds, from the control's first frame to its last. Of a
-    control that a panel closes they end with the last frame that shows its outcome, and, where there is room, the very
-    last one."""
+    """Return control, void and the times (moments,) in seconds that tell what the control shows."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, at, moments)
@@ -168,8 +164,7 @@ def draw_pair(
 
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
-    """Draw scenario and ground truth in bold (without ids the truth below), and the question below them; also the
-    void's question if it differs."""
+    """Draw scenario and ground truth in bold, and the questions below them."""
     by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
     same = by_side["control"] == by_side["void"]
     questions = [by_side["control"]] if same else [f"{side}: {question}" for side, question in by_side.items()]

@@ -29,9 +29,7 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def states_and_output(results: Results) -> str:
-    """Return how many voids that were answered states and output put among voids, and how well either orders the
-    sides.
-    """
+    """Return how many answered voids states and output put among voids, and how well either orders the sides."""
     sentences = list[str]()
     for model, of in _models(scored_items(results)):
         voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]

@@ -110,48 +110,32 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first; one table
-    for each panel. said: further notes."""
-    return "\n".join(table_text(table) for table in ranked_tables(board, robust, said))
+    """Return LEADERBOARD rows, with ROBUST figures and further notes, as text: a table for each panel, best first."""
+    return "\n".join(table_text(table) for table in leaderboards(board, robust, said, brief=True))
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first. said:
-    further notes."""
+    """Return LEADERBOARD rows, with ROBUST figures and further notes, as Markdown with its legend, best first."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
-    return "\n".join([*(table_markdown(table) for table in ranked_tables(board, robust, said)), *terms]) + "\n"
-
-
-def ranked_tables(
-    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
-) -> list[PrintedTable]:
-    """Return the brief table that ranks the entries of each panel. said: further notes of the first."""
-    return _with_notes([_of_one_panel(part, robust, True, suffix)[0] for suffix, part in _by_panel(board)], said)
-
-
-def _with_notes(tables: list[PrintedTable], said: Sequence[str]) -> list[PrintedTable]:
-    first = replace(tables[0], notes=[*tables[0].notes, *said])
-    return [first, *tables[1:]]
+    tables = leaderboards(board, robust, said, brief=True)
+    return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
 
 
 def leaderboards(
-    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
-    """Return tables of LEADERBOARD rows for each panel, whose entries are never ranked together: first the one that
-    ranks the entries, then one for each other dataset. The overall table has the figures of ROBUST rows, if there are
-    any.
+    """Return tables of LEADERBOARD rows for each panel: one that ranks the entries, then one for each other dataset.
 
-    The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
-    without a row in it comes last. said: further notes of the first table.
+    The first is `overall`, or the board's first dataset if no model has all four. An entry without a row comes last.
+    said: further notes of the first table. brief: the first of each panel alone, narrower.
     """
-    tables = [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, False, suffix)]
-    return _with_notes(tables, said)
+    panels = [_of_one_panel(part, robust, brief, suffix) for suffix, part in _by_panel(board)]
+    tables = [table for of_panel in panels for table in of_panel[: 1 if brief else None]]
+    return [replace(tables[0], notes=[*tables[0].notes, *said]), *tables[1:]]
 
 
 def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """Return the rows by panel, with what tells the names of their tables apart; entries of several panels come
-    last.
-    """
+    """Return the rows by panel, entries of several panels last, with the suffix of their tables' names."""
     if board.empty:
         return [("", board)]
     of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
@@ -274,8 +258,7 @@ def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """Return one row per (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, and
-    marks. For an entry without a row of the dataset the counts are sums over all its rows."""
+    """Return one row per (model, regime), best first; without a row of the dataset, counts are sums over all rows."""
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in of_several_runs(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row

@@ -32,16 +32,8 @@ def report_html(
 ) -> str:
     """Render the report as one page that opens from disk and makes no network request.
 
-    Parameters
-    ----------
-    board, robust
-        LEADERBOARD and ROBUST rows; `said` are further notes below the first leaderboard.
-    figures, pictures, tables
-        Cards. Those that were run are shown, tables in a collapsed appendix; of the others the reasons are listed.
-    address, explorer
-        With `address` every number is a link to the items behind it. `explorer` is the address of the explorer.
-    terms
-        Further words of the legend.
+    Cards that were run are shown, tables in a collapsed appendix; of the others the reasons are listed. With `address`
+    every number is a link to the items behind it. said: notes below the leaderboard; terms: words of the legend.
     """
     boards = leaderboards(board, robust, said)
     ranked = [table for table in boards if table.title == boards[0].title]  # one for each panel

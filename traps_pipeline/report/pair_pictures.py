@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.arms_sheet import arms_sheets
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
-from traps_pipeline.report.figures.shortcut_figure import shortcut_figure
+from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.report.worked_example import Example, example_figure, worked_example
 from traps_pipeline.report.writing import NotRun
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, VIDEOS
@@ -28,18 +28,10 @@ NO_ITEMS = "this study has no items yet"
 
 @dataclass(frozen=True)
 class Picture:
-    """One or several figures made from clips.
+    """One or several figures made from clips, by file name.
 
-    Parameters
-    ----------
-    make
-        Returns the figures by file name. Raises NotRun, and TrapsError for a damaged clip.
-    reads
-        The stages that they are made from.
-    inputs
-        The rows that they show, as JSON; null where all rows of the stages matter.
-    kind
-        How the page holds them: "webp" where they show frames, else "svg".
+    make: raises NotRun, and TrapsError for a damaged clip. inputs: the rows that they show, as JSON; null where all
+    rows of the stages `reads` matter. kind: "webp" where they show frames, else "svg".
     """
 
     name: str

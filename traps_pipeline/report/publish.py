@@ -21,13 +21,13 @@ from traps_pipeline.report.cards import (
     picture_card,
     table_card,
 )
-from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.pair_pictures import PairPictures
+from traps_pipeline.report.printed_tables import audit_table
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_findings import study_findings
-from traps_pipeline.report.tables.audited import audit_table
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.terms import INSIDE_TERMS
 from traps_pipeline.report.writing import NotRun, environment, figure_files, table_files
@@ -39,8 +39,7 @@ PAPER = "paper"  # the chapter of cards that stand beside the study's, and follo
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is made, or what the paper has beside one. reads: the stages that it is made from; inputs:
-    instead, the rows that matter, as JSON; null where all rows matter."""
+    """A card before it is made. reads: its stages; inputs: instead, the rows that matter, as JSON; null for all."""
 
     chapter: str
     name: str
@@ -55,7 +54,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
         Part("figures", report.name, lambda report=report: figure_card(report, sources), report.reads)
-        for report in sorted(FIGURES, key=lambda report: report.name not in first)
+        for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
     pictures = [
         Part(
@@ -69,11 +68,11 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     ]
     tables = [
         Part("tables", report.name, lambda report=report: table_card(report, sources, address), report.reads)
-        for report in TABLES
+        for report in TABLE_REPORTS
     ]
     paper = [
         Part(PAPER, f"{kind}-{report.name}", lambda report=report: paper_card(report, sources), ("published",))
-        for kind, reports in (("figure", FIGURES), ("table", TABLES))
+        for kind, reports in (("figure", FIGURE_REPORTS), ("table", TABLE_REPORTS))
         for report in reports
         if report.published
     ]
@@ -105,11 +104,9 @@ def metrics_lines(board: pd.DataFrame) -> str:
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write every table (CSV, LaTeX, Markdown, Parquet), every figure that was run (PDF, SVG, PNG) and the report page
-    to a folder, from the study's tables and the published numbers; return the number of files.
+    """Write every table, every figure that was run and the report page to a folder; return the number of files.
 
-    Each file is written whole or not at all, and last `index.html`, which lists them. say gets one line per table and
-    figure.
+    Each file is written whole or not at all, and last `index.html`, which lists them. say gets a line each.
     """
     sources, paths = Sources(workspace), list[str]()
     for path, content in _exported(sources, say):
@@ -121,7 +118,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 
 def _exported(sources: Sources, say: Callable[[str], None]) -> Iterator[tuple[str, bytes]]:
     for source in (sources.study, sources.paper):
-        for report in [r for r in (*TABLES, *FIGURES) if source.is_study or r.published]:
+        for report in [r for r in (*TABLE_REPORTS, *FIGURE_REPORTS) if source.is_study or r.published]:
             yield from report.files(source).items()
             say(f"{source.source}: {report.name}")
     yield from ((f"tables/{RECOMPUTED}/{name}", content) for name, content in table_files(audit_table()).items())

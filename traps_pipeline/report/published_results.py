@@ -7,16 +7,17 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.report.mechanism_page import (
-    published_cosines,
-    published_effects,
-    published_probes,
-)
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
+from traps_pipeline.protocol.datasets import LONG
 from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Makers, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.published import published, published_cells
+from traps_pipeline.storage.tables import Table
 
+PAIRS = 50  # a cell (docs/spec.md 8.2)
+STEERED_LAYERS = {"qwen3-vl-8b": 20, "gemma-4-e4b": 35, "llava-next-video-7b": 28}
+_FLAGS = ("own_best", "all_sample_best", "chosen")
 _AXES = ("hp", "ii", "hp_and_ii", "es", "doubt")
 
 
@@ -77,10 +78,55 @@ def _confabulation(results: Results) -> pd.DataFrame:
     return rows[["model", "n"]].assign(**shares, epoch="original")
 
 
+def _probes(results: Results) -> pd.DataFrame:
+    """Return PROBES rows: transfer, and confabulated at the layer of transfer, as the paper names no other."""
+    rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"}).assign(scope="all")
+    transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
+    confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
+    table = _as(PROBES, [transfer, confabulated])
+    return table.assign(**{flag: table[flag].eq(True) for flag in _FLAGS})
+
+
+def _cosines(results: Results) -> pd.DataFrame:
+    """Return COSINES rows: the matrix of qwen3-vl-8b, and the few values of other models in the paper's text."""
+    matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
+    few = published("other")
+    few = few.loc[few["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
+    pairs = few["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    few = few.assign(source=pairs[0], other=pairs[1], cosine=few["value"].astype(float))
+    mirrored = few.rename(columns={"source": "other", "other": "source"})
+    both = pd.concat([matrix, few, mirrored], ignore_index=True)
+    both = _long(both).rename(columns={"source": "dataset", "other": "other_dataset"})
+    return _as(COSINES, [both.assign(layer=_steered(both), prompt="standard", other_prompt="standard")])
+
+
+def _effects(results: Results) -> pd.DataFrame:
+    """Return STEERING_EFFECTS rows of the dose-response tables, with the regimes that their captions state."""
+    qwen = published("steering_dose_qwen").assign(model="qwen3-vl-8b", epoch="original")
+    gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
+    rows = _long(pd.concat([qwen, gemma], ignore_index=True))
+    rows = rows.rename(columns={"direction_regime": "directions", "inference_regime": "regime"})
+    rows = rows.assign(kind="void", unit="alpha", dose=rows["alpha"], signs="label", n=PAIRS, layer=_steered(rows))
+    sides = [rows.assign(side=s, abstention=rows[f"{s}_abstention_pct"] / 100) for s in ("control", "void")]
+    return _as(STEERING_EFFECTS, sides)
+
+
+def _long(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.replace({name: LONG for name in ("source", "target", "other") if name in rows})
+
+
+def _steered(rows: pd.DataFrame) -> list[int]:
+    return [STEERED_LAYERS[model] for model in rows["model"]]
+
+
+def _as(table: Table, parts: list[pd.DataFrame]) -> pd.DataFrame:
+    return pd.concat(parts, ignore_index=True).reindex(columns=pd.Index(table.names))
+
+
 class PublishedResults(Results):
     """The paper's numbers, as shipped in `assets/published`, from which figures are drawn and further tables computed.
 
-    The tables that the paper prints are shown by `report.printed`. A frame from which neither is made has no rows.
+    `report.printed_tables` shows those that the paper prints. A frame from which neither is made has no rows.
     """
 
     source = "published"
@@ -93,7 +139,7 @@ class PublishedResults(Results):
         "labels": lambda results: _none("dataset", "sub_scenario", "label", "acc"),
         "confabulation": _confabulation,
         "composition": lambda results: _none("taxonomy", "category", "void", "n", "n_ill_posed"),
-        "probes": lambda results: published_probes(),
-        "cosines": lambda results: published_cosines(),
-        "effects": lambda results: published_effects(),
+        "probes": _probes,
+        "cosines": _cosines,
+        "effects": _effects,
     }

@@ -64,8 +64,7 @@ Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the resul
 
 
 class LazyFrame:
-    """A frame of `Results`, made when it is first read: by the results' own maker of that name if there is one, else by
-    `derive` from the other frames, else it has the rows of `table`."""
+    """A frame of `Results`, made when first read: by their maker of its name, by `derive`, or the rows of `table`."""
 
     def __init__(
         self, doc: str = "", *, table: Table | None = None, derive: Callable[[Results], pd.DataFrame] | None = None
@@ -92,8 +91,7 @@ class LazyFrame:
 class Results:
     """One set of results; a frame has no rows if its part was not run.
 
-    To add a frame, add an attribute here, and a function of that name to the `makers` of a study's and of the paper's
-    results.
+    A new frame is an attribute here, and a function of that name in the `makers` of a study's and the paper's results.
     """
 
     source = ""  # in words, for titles
@@ -183,8 +181,7 @@ class Results:
         return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
-        """Return why two entries (model, regime) may not be compared on a dataset or `overall`, from the contrasts,
-        which check every item; None if they may be compared."""
+        """Return why two entries (model, regime) may not be compared on a dataset; None if they may."""
         return self._refusals.get((dataset, frozenset((left, right))))
 
     @cached_property

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
-from traps_pipeline.report.catalogue import FIGURES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
 from traps_pipeline.report.writing import fraction, percent
@@ -30,10 +30,7 @@ class Finding:
 
 
 def study_findings(results: Results) -> list[Finding]:
-    """Return the findings of a study, the most important first; none if it has no overall figures.
-
-    Reference strategies, whose score is known, are left out where any other model was asked.
-    """
+    """Return a study's findings, the most important first; of reference strategies only if no other model was asked."""
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):
@@ -41,7 +38,7 @@ def study_findings(results: Results) -> list[Finding]:
     references = models_of(group="reference")
     own = rows.loc[[model not in references for model in rows["model"]]]
     own = own if len(own) else rows
-    inside = [(report.name, report.finding(results)) for report in FIGURES] if results.mechanism else []
+    inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
         *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
         *_missing(own), *(Finding(text, f"figure-{name}") for name, text in inside if text),

@@ -48,8 +48,7 @@ DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0
 
 @dataclass(frozen=True)
 class Behind:
-    """The items that a number is computed from: those of this dataset, model, regime and side; an empty field means
-    all."""
+    """The items that a number is computed from; an empty field means all."""
 
     dataset: str = ""
     model: str = ""
@@ -120,8 +119,7 @@ class Column:
         return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
     def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
-        """Return the text or number of a cell, its spread and its mark, as printed; a part that the cell lacks is
-        empty."""
+        """Return the text or number of a cell, its spread and its mark, as printed; empty where it lacks one."""
         import pandas as pd
 
         value = row.get(self.field)
@@ -172,8 +170,7 @@ class PrintedTable:
 
     @cached_property
     def marked(self) -> set[Column]:
-        """The columns in which some number has a mark. The other cells of such a column leave space for a mark, so that
-        numbers stay aligned."""
+        """The columns in which some number has a mark; their other cells leave space for one."""
         return {column for column in self.columns if any(column.parts(row)[2] for row in self.records)}
 
     @property
@@ -276,8 +273,7 @@ def table_latex(table: PrintedTable) -> str:
 
 
 def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = None) -> str:
-    """Return an HTML fragment: the table in a scrolling box, notes below; escaped. With `address`, every number that
-    has items behind it is a link to them."""
+    """Return a table in a scrolling box, notes below, escaped. `address`: numbers link to the items behind them."""
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
         shown = column.is_number and figure not in ("", NONE)
@@ -289,8 +285,7 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
 
 @cache
 def environment() -> jinja2.Environment:
-    """Return the Jinja2 environment of every page: it escapes all text, and an unknown name is an error. Templates are
-    compiled once."""
+    """Return the Jinja2 environment of every page: all text is escaped, and an unknown name is an error."""
     import jinja2
 
     return jinja2.Environment(
@@ -331,9 +326,7 @@ def _latex(cell: str) -> str:
 
 
 def _parquet(table: PrintedTable) -> bytes:
-    """Return the Parquet file; text columns have type text even if all values are null, so that the schema is
-    constant.
-    """
+    """Return the Parquet file; text columns have type text even if all is null, so that the schema is constant."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -364,8 +357,7 @@ def figure_style() -> Iterator[None]:
 def new_figure(
     width: float, height: float, dpi: float | None = None, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """Return an empty figure (inches) with its own canvas; draw inside `figure_style`. layout: None keeps every element
-    where it is placed."""
+    """Return an empty figure (inches) with its own canvas. layout: None keeps every element where it is placed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

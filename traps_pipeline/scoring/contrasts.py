@@ -34,7 +34,7 @@ from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, REGIME_TESTS
 from traps_pipeline.scoring.standings import means_over_runs, standings
 
-FIGURES = ("pecs", "j")
+CONTRASTED_FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
 VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # columns that `version_contrasts` has for each side
 _FAMILY = ["kind", "dataset", "figure", "_regime"]
@@ -51,12 +51,12 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
     items_of, sizes = answered(verdicts), _scenarios(verdicts)
-    means = means_over_runs(metrics).loc[:, [*FIGURES]].to_dict("index")
+    means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
     rows = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
         items = items_of[(*left, dataset)]
         refused = refusal(items, items_of[(*right, dataset)])
-        for figure in FIGURES:
+        for figure in CONTRASTED_FIGURES:
             row = {"kind": kind, "dataset": dataset, "figure": figure, "_regime": left[1] if kind == "models" else ""}
             row |= dict(zip(_SIDES, (*left, *right), strict=True)) | {"refused": refused}
             if refused is None:
@@ -91,7 +91,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     rows = []
     for entry, about in board.to_dict("index").items():
         refused = refusal(asked[0][entry], asked[1][entry])
-        for figure in FIGURES:
+        for figure in CONTRASTED_FIGURES:
             values = {f"{name}_{side}": about[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")}
             values |= {side: about[f"{figure}_{side}"] for side in ("then", "now")}
             row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
@@ -136,7 +136,7 @@ def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
     """Return `leaderboard.standings` of verdicts, indexed by ENTRY."""
     cells = [cell_metrics(part, {}) for _, part in verdicts.groupby("dataset")]
     board = standings(pd.concat(cells, ignore_index=True)).set_index(ENTRY)
-    return board.loc[:, ["n_pairs", *FIGURES, *VERSION_SIDES]]
+    return board.loc[:, ["n_pairs", *CONTRASTED_FIGURES, *VERSION_SIDES]]
 
 
 def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["dataset", "model", "regime", "run"]
-FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
+CELL_FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
 BROKEN = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
@@ -123,7 +123,7 @@ def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) ->
 
 
 def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return FIGURES of every cell, (cells,) each."""
+    """Return CELL_FIGURES of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
     j = abs_rec - false_abs
     return {

@@ -14,8 +14,8 @@ from traps_pipeline.scoring.metrics import (
     BOUNDS,
     BROKEN,
     CELL,
+    CELL_FIGURES,
     COUNTED,
-    FIGURES,
     REJECTS,
     joined_epochs,
     joined_versions,
@@ -45,7 +45,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     runs. Items without a text count in no figure; where there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
-    means, deviations = (groups[FIGURES].agg(f) for f in (mean, _deviation))
+    means, deviations = (groups[CELL_FIGURES].agg(f) for f in (mean, _deviation))
     means["pecs_by_family"] = groups["pecs_by_family"].agg(mean)
     bounds, sums = groups[BOUNDS].agg(mean), cast(pd.DataFrame, groups[_SUMMED].sum())
     sums[REJECTS] = groups[REJECTS].sum(min_count=1)
@@ -63,8 +63,8 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
-    return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean))
+    """Return CELL_FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
+    return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[CELL_FIGURES].agg(mean))
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
@@ -89,7 +89,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
     counts[REJECTS] = complete_runs[REJECTS].sum(min_count=1)
-    overall = complete_runs[[*FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
+    overall = complete_runs[[*CELL_FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = complete_runs["epoch"].agg(joined_epochs)
     overall["panel"] = complete_runs["panel"].agg(joined_epochs)
     overall["benchmark_version"] = complete_runs["benchmark_version"].agg(joined_versions)

@@ -54,8 +54,7 @@ class Touched:
 
 
 def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
-    """Return what a correction of a scenario touches, against its SCENE_SPECS row. Raises TrapsError where the family
-    refuses the parameters."""
+    """Return what a correction touches of a SCENE_SPECS row. Raises TrapsError for parameters that are refused."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:

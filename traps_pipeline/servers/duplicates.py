@@ -25,9 +25,7 @@ class Neighbour:
 
 
 def fingerprint(clip: Path) -> np.ndarray:
-    """Return the difference hash of a clip's first, middle and last frame: (3 * SIDE * SIDE,) bool. Raises
-    DamagedClip.
-    """
+    """Return the difference hash of first, middle and last frame, (3 * SIDE * SIDE,) bool. Raises DamagedClip."""
     import cv2
 
     frames, _ = decode(clip)

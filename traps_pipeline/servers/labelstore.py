@@ -90,8 +90,7 @@ class LabelStore:
             ) from error
 
     def handle(self, who: str, task: str, unit: str) -> str:
-        """Return the name under which one person's browser knows a unit: it reveals nothing, and is another's for
-        others."""
+        """Return the name of a unit in one person's browser: it reveals nothing, and is another's for others."""
         content = "\0".join((who, task, unit)).encode()
         return hmac.new(self._secret.encode(), content, "sha256").hexdigest()[:HANDLE_DIGITS]
 

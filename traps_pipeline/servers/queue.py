@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import pandas as pd
 
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.judging.verdicts import current
+from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 QueueName = Literal["unreviewed", "judges", "models", "alike", "all"]
@@ -25,7 +25,7 @@ MEANINGS: Mapping[QueueName, str] = {
 def flags(workspace: Workspace) -> pd.DataFrame:
     """By scenario: how many judged answers have no unanimous panel (`judges`), and how evenly models are divided on the
     controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
-    rows = current(workspace, VERDICTS, ["scenario_id", "item_id", "side", "n_valid", "correct", "unanimous"])
+    rows = current_rows(workspace, VERDICTS, ["scenario_id", "item_id", "side", "n_valid", "correct", "unanimous"])
     judged = rows.loc[rows["n_valid"] > 0]
     split = (~judged["unanimous"].astype(bool)).groupby(judged["scenario_id"]).sum()
     controls = rows.loc[(rows["side"] == "control") & rows["correct"].notna()]

@@ -240,16 +240,13 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """Return what shows and then asks what decisions touch. An experiment that is not among ours has a file of its
-        own."""
+        """Return what shows and then asks what decisions touch, for ours or for an experiment's own file."""
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]
 
     def strip(self, scenario_id: str) -> bytes:
-        """Return the contact strip: frames of the control above the void's at the same times, as JPEG. Raises
-        NotThere.
-        """
+        """Return frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
         import cv2
 
         from traps_pipeline.video.encode import decode

@@ -1,10 +1,17 @@
-"""The benchmark's tables: scenarios, their clips, the questions put to models."""
+"""The benchmark's tables: scenarios, their clips, the questions put to models; rows of what is still in them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from traps_pipeline.storage.workspace import Workspace
 
 Taxonomy = Annotated[str, "occlusion or chaotic"]
 Labels = Annotated[list[str], "closed set of answers"]
@@ -128,3 +135,18 @@ class ItemRow:
 
 
 ITEMS = Table("items", ItemRow, partition_by=("dataset",), key=("item_id",))
+
+
+def current_rows(
+    workspace: "Workspace",
+    table: Table,
+    columns: Sequence[str] | None = None,
+    dataset: str | Sequence[str] = DATASETS,
+) -> "pd.DataFrame":
+    """Return the rows of a table whose items are still in the benchmark; those of arms only where they are named.
+
+    Every count uses these: a cell that was evaluated before a correction may hold others.
+    """
+    rows = workspace.tables.read_all(table, columns, dataset=dataset)
+    current_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    return rows.loc[rows["item_id"].isin(current_ids)].reset_index(drop=True)

@@ -22,8 +22,7 @@ from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report.explorer import answer_shards
 from traps_pipeline.report.explorer.answer_shards import NO, NONE, StudyAnswers, study_answers
-from traps_pipeline.report.explorer.scripts import data_script
-from traps_pipeline.report.explorer.site import INDEX, SCRIPT, script, write_site
+from traps_pipeline.report.explorer.site import INDEX, SCRIPT, data_script, script, write_site
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

@@ -2,12 +2,15 @@
 
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.benchmark import filmed_arms, stored_evidence
+from traps_pipeline.benchmark import videos as clips
 from traps_pipeline.benchmark.composition import problems
+from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
-from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.pipeline.stage import is_declared, of, source, stage
@@ -16,48 +19,31 @@ from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VI
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-GROUP = "benchmark"
 RENDERS = RunResources(memory_gb=0.6, each_gb=0.4)  # measured: 0.4 GB of the process, 0.35 of each that draws
-released_specs = source(
-    "released_specs",
-    released_version,
-    group=GROUP,
-    doc="Frozen scenarios under scene_specs/released, one resolved record each.",
-    kinds=["json"],
-    scheme=CATEGORY,
-)
-corrections = source(
-    "corrections",
-    corrections_version,
-    group=GROUP,
-    doc="Review decisions under scene_specs/corrections, folded over the released records.",
-    kinds=["json"],
-    scheme=CATEGORY,
-)
+_stage = partial(stage, group="benchmark")
+_source = partial(source, group="benchmark", kinds=["json"], scheme=CATEGORY)
 category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
 category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonomy_of_category(category)))
 
 
-def _make_specs(workspace: Workspace, category: str) -> StageOutput:
-    """Return scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated
-    here, once."""
-    rows, resolved = build_specs(workspace, category)
-    return StageOutput(rows, beside=resolved)
+@_source()
+def released_specs(workspace: Workspace, category: str) -> str:
+    """Frozen scenarios under scene_specs/released, one resolved record each."""
+    return released_version(workspace, category)
 
 
-def _evidence(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
-    def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> Any:
-        from traps_pipeline.benchmark import stored_evidence as evidence
-
-        return getattr(evidence, find)([item.spec for item in output.beside])
-
-    return wrong
+@_source()
+def corrections(workspace: Workspace, category: str) -> str:
+    """Review decisions under scene_specs/corrections, folded over the released records."""
+    return corrections_version(workspace, category)
 
 
-scene_specs = stage(
+def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, StageOutput], Any]:
+    return lambda workspace, key, made: find([item.spec for item in made.beside])
+
+
+@_stage(
     SCENE_SPECS,
-    _make_specs,
-    group=GROUP,
     parents=[released_specs, corrections],
     scheme=CATEGORY,
     code="4",
@@ -74,20 +60,20 @@ scene_specs = stage(
             "control_certified",
             "By the evidence in each record, the control can be answered: its outcome is settled in time, with a "
             "margin, and legible.",
-            _evidence("unanswerable_controls"),
+            _evidence(stored_evidence.unanswerable_controls),
         ),
         Check(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
             "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that a panel closes "
             "be answered from its last frame. `traps benchmark certify` computes this again.",
-            _evidence("answerable_voids"),
+            _evidence(stored_evidence.answerable_voids),
         ),
         Check(
             "ill_posed_certified",
             "The inventory refutes each ill-posed question, or the question asks for what no video shows; neither "
             "holds for a well-posed question.",
-            _evidence("answerable_ill_posed"),
+            _evidence(stored_evidence.answerable_ill_posed),
         ),
         Check(
             "answers_balanced",
@@ -100,28 +86,16 @@ scene_specs = stage(
         ),
     ],
 )
-
-
-def _make_videos(workspace: Workspace, category: str) -> StageOutput:
-    """Return control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
-    whichever of the processes that are at it."""
-    from traps_pipeline.benchmark.videos import build_videos
-
-    rows, leaks = build_videos(workspace, category)
-    return StageOutput(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
+def scene_specs(workspace: Workspace, category: str) -> StageOutput:
+    """Return scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated
+    here, once."""
+    rows, resolved = build_specs(workspace, category)
+    return StageOutput(rows, beside=resolved)
 
 
 def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
-    from traps_pipeline.benchmark.videos import render_videos
-
-    frames, is_whole = render_videos(workspace, category, wait=wait)
+    frames, is_whole = clips.render_videos(workspace, category, wait=wait)
     return Tally(frames=frames), is_whole
-
-
-def _to_render_s(workspace: Workspace, category: str) -> float:
-    from traps_pipeline.benchmark.videos import seconds_left
-
-    return seconds_left(workspace, category)
 
 
 def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[str]:
@@ -129,17 +103,15 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
     return [row.path for row in output.rows(VIDEOS) if counts[row.side, row.frames_sha256] > 1]
 
 
-videos = stage(
+@_stage(
     VIDEOS,
-    _make_videos,
-    group=GROUP,
     parents=[scene_specs],
     scheme=CATEGORY,
     code="3",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
-    shared=ConcurrentBuild(_render, _to_render_s),
-    lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in missing_clips(workspace, str(key))],
+    shared=ConcurrentBuild(_render, clips.seconds_left),
+    lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in clips.missing_clips(workspace, key)],
     checks=[
         Check(
             "panel_hides",
@@ -149,59 +121,35 @@ videos = stage(
         Check("clips_distinct", "No two clips of a category show the same frames.", _alike, blocks=False),
     ],
 )
-
-
-def _make_arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return the arms and variations of a category's scenarios that the study asks: clips and questions beside the
-    pairs."""
-    from traps_pipeline.benchmark.filmed_arms import build_arms
-
-    rows = build_arms(workspace, category)
-    admitted = sum(row.refused is None for row in rows)
-    return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
+def videos(workspace: Workspace, category: str) -> StageOutput:
+    """Return control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
+    whichever of the processes that are at it."""
+    rows, leaks = clips.build_videos(workspace, category)
+    return StageOutput(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
 
 
 def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
-    from traps_pipeline.benchmark.filmed_arms import film_arms
-
-    frames, is_whole = film_arms(workspace, category, wait=wait)
+    frames, is_whole = filmed_arms.film_arms(workspace, category, wait=wait)
     return Tally(frames=frames), is_whole
 
 
-def _to_film_s(workspace: Workspace, category: str) -> float:
-    from traps_pipeline.benchmark.filmed_arms import seconds_left
-
-    return seconds_left(workspace, category)
-
-
-def _unmade_arms(workspace: Workspace, category: str) -> list[str]:
-    from traps_pipeline.benchmark.filmed_arms import unmade
-
-    return unmade(workspace, category)
-
-
-arms = stage(
+@_stage(
     ARMS,
-    _make_arms,
     group="arms",
     parents=[scene_specs, videos],
     scheme=CATEGORY,
     code="3",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
-    shared=ConcurrentBuild(_film, _to_film_s),
+    shared=ConcurrentBuild(_film, filmed_arms.seconds_left),
     wants=lambda wanted, key: bool({*wanted.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
-    lost=lambda workspace, key: _unmade_arms(workspace, str(key)),
+    lost=filmed_arms.unmade,
 )
-
-
-def _make_items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, two per pair: the control, and the void that differs from it by one
-    change."""
-    from traps_pipeline.benchmark.items import build_items
-
-    rows = build_items(workspace, dataset)
-    return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})
+def arms(workspace: Workspace, category: str) -> StageOutput:
+    """Return the arms and variations that the study asks of a category: clips and questions beside the pairs."""
+    rows = filmed_arms.build_arms(workspace, category)
+    admitted = sum(row.refused is None for row in rows)
+    return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
 
 
 def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> dict[str, list[str]]:
@@ -211,10 +159,8 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     return {pair: found for pair, found in sides.items() if tuple(sorted(found)) != sides_of(str(key))}
 
 
-items = stage(
+@_stage(
     ITEMS,
-    _make_items,
-    group=GROUP,
     parents=[
         of(scene_specs, category_to_datasets),
         of(videos, category_to_datasets),
@@ -236,3 +182,7 @@ items = stage(
         ),
     ],
 )
+def items(workspace: Workspace, dataset: str) -> StageOutput:
+    """Return the items that models are asked, two per pair: the control, and the void that differs by one change."""
+    rows = build_items(workspace, dataset)
+    return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})

@@ -1,6 +1,7 @@
 """The evaluation group: answers of models, votes of judges, verdicts of the panel. A cell is dataset x evaluation."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, cast
 
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
@@ -12,7 +13,7 @@ from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import READING
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.pipeline.graph import Check, Collect
+from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Records, StudyFile
 from traps_pipeline.pipeline.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.pipeline.stage import of, source, stage
@@ -22,46 +23,28 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-GROUP = "evaluation"
 MAX_INVALID_SHARE = 0.05
 ITEMS_SHOWN = 40
-models = source(
-    "models",
-    lambda workspace, key: answering_version(Evaluation.parse(key)),
-    group=GROUP,
-    doc="assets/models.yaml: the settings that a model's answers depend on, by evaluation.",
-    kinds=["yaml"],
-    scheme=EVALUATION,
-)
-prompts = source(
-    "prompts",
-    lambda workspace, key: prompt_version(
-        Evaluation.parse(key).regime, {d for asked in workspace.study.experiments.values() for d in asked.datasets}
-    ),
-    group=GROUP,
-    doc="assets/prompts: the regime's system prompt, by evaluation.",
-    kinds=["text"],
-    scheme=EVALUATION,
-)
-judges = source(
-    "judges",
-    lambda workspace, key: panel_version(workspace.study.panel),
-    group=GROUP,
-    doc="assets/judges.yaml and the judges' prompts: the study's panel.",
-    kinds=["yaml"],
-)
+_stage, _source = partial(stage, group="evaluation", scheme=CELL), partial(source, group="evaluation")
 
 
-def _collect_answers(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return answers of a model under a regime in a run, one row per item; answers in the ledger are not asked
-    again.
-    """
-    return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
+@_source(kinds=["yaml"], scheme=EVALUATION)
+def models(workspace: Workspace, key: str) -> str:
+    """assets/models.yaml: the settings that a model's answers depend on, by evaluation."""
+    return answering_version(Evaluation.parse(key))
 
 
-def _collect_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
-    return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
+@_source(kinds=["text"], scheme=EVALUATION)
+def prompts(workspace: Workspace, key: str) -> str:
+    """assets/prompts: the regime's system prompt, by evaluation."""
+    asked = {d for experiment in workspace.study.experiments.values() for d in experiment.datasets}
+    return prompt_version(Evaluation.parse(key).regime, asked)
+
+
+@_source(kinds=["yaml"])
+def judges(workspace: Workspace, _: None) -> str:
+    """assets/judges.yaml and the judges' prompts: the study's panel."""
+    return panel_version(workspace.study.panel)
 
 
 def _with_items(
@@ -69,11 +52,8 @@ def _with_items(
 ) -> Iterator[tuple[str | None, StageOutput]]:
     """Add a cell's items to what is shown of it."""
     for cell, output in cells:
-        figures = {
-            **output.shown,
-            **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], output.content)),
-        }
-        yield cell.key, StageOutput(output.content, output.tally, figures)
+        items_shown = _items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], output.content))
+        yield cell.key, StageOutput(output.content, output.tally, {**output.shown, **items_shown})
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
@@ -93,25 +73,21 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
 
 def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
-    n_items = state.rows if state else 0
-    n_rows = len(output.rows(RESPONSES))
+    n_items, n_rows = state.rows if state else 0, len(output.rows(RESPONSES))
     return "" if n_rows == n_items else f"{n_rows} rows for {n_items} items"
 
 
-responses = stage(
+@_stage(
     RESPONSES,
-    Collect(_collect_answers),
-    group=GROUP,
-    parents=[
-        of(items, by_dataset),
-        of(models, by_evaluation),
-        of(prompts, by_evaluation),
-    ],
-    scheme=CELL,
+    parents=[of(items, by_dataset), of(models, by_evaluation), of(prompts, by_evaluation)],
     code=f"3.{READING}",
     cost="money",
     checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
+    side_by_side=True,
 )
+def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
+    """Return a model's answers under a regime in a run, one row per item; those in the ledger are not asked again."""
+    return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 
 def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
@@ -121,12 +97,9 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     return f"{invalid} of {len(cast_votes)} votes are invalid" if many else ""
 
 
-votes = stage(
+@_stage(
     VOTES,
-    Collect(_collect_votes),
-    group=GROUP,
     parents=[of(items, by_dataset), responses, judges],
-    scheme=CELL,
     code="3",
     cost="money",
     checks=[
@@ -137,15 +110,11 @@ votes = stage(
             blocks=False,
         )
     ],
+    side_by_side=True,
 )
-
-
-def _make_verdicts(workspace: Workspace, key: str) -> StageOutput:
-    """Return the verdict of the panel's majority on each item of a cell."""
-    from traps_pipeline.judging.verdicts import decide_cell
-
-    rows = decide_cell(workspace, Cell.parse(key))
-    return StageOutput(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
+def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
+    """Return votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
+    return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 
 def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
@@ -154,12 +123,15 @@ def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput
     return "" if n_answers == len(output.frame) else f"{len(output.frame)} verdicts for {n_answers} answers"
 
 
-verdicts = stage(
+@_stage(
     VERDICTS,
-    _make_verdicts,
-    group=GROUP,
     parents=[of(items, by_dataset), responses, votes, judges],
-    scheme=CELL,
     code="3",
     checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
 )
+def verdicts(workspace: Workspace, key: str) -> StageOutput:
+    """Return the verdict of the panel's majority on each item of a cell."""
+    from traps_pipeline.judging.verdicts import decide_cell
+
+    rows = decide_cell(workspace, Cell.parse(key))
+    return StageOutput(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})

@@ -3,17 +3,7 @@
 from functools import partial
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.control_rows import (
-    GATE,
-    ITEM_SCORES,
-    LENS,
-    PATCHING,
-    PROBE_BASELINES,
-    RISK_COVERAGE,
-    SENTENCES,
-    STEERING_NULLS,
-    STEERING_PECS,
-)
+from traps_pipeline.mechanism import control_rows as tables
 from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
 from traps_pipeline.models.registry import ModelEntry, local_models
@@ -31,7 +21,6 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steering_effects,
     steers,
 )
-from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
@@ -42,24 +31,23 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.stored import StoredStates
 
-patching_settings = source(
-    "patching_settings",
-    lambda workspace, key: patching_version(workspace, Extraction.parse(key)),
-    group=GROUP,
-    doc="The inputs of patching besides items: checkpoint, precision, prompt, pairs and sites.",
-    kinds=["yaml"],
-    scheme=EXTRACTION,
-)
+_source = partial(source, group=GROUP, kinds=["yaml"], scheme=EXTRACTION)
+_stage = partial(stage, group=GROUP, scheme=EXTRACTION, cost="machine")
+_STATES = of(hidden_states, by_extraction, need="some")
+_ASKED = (*DATASETS, *PROBED_ARMS)
+_GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in PROMPTING])
 
 
-sentence_settings = source(
-    "sentence_settings",
-    lambda workspace, key: sentence_version(workspace, Extraction.parse(key)),
-    group=GROUP,
-    doc="The inputs of sentences besides items and answers: checkpoint, precision, prompt, the study's sentences.",
-    kinds=["yaml"],
-    scheme=EXTRACTION,
-)
+@_source()
+def patching_settings(workspace: Workspace, key: str) -> str:
+    """The inputs of patching besides items: checkpoint, precision, prompt, pairs and sites."""
+    return patching_version(workspace, Extraction.parse(key))
+
+
+@_source()
+def sentence_settings(workspace: Workspace, key: str) -> str:
+    """The inputs of sentences besides items and answers: checkpoint, precision, prompt, the study's sentences."""
+    return sentence_version(workspace, Extraction.parse(key))
 
 
 def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
@@ -78,44 +66,18 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
     return model, StoredStates.of(workspace, extraction)
 
 
-def _make_baselines(workspace: Workspace, key: str) -> StageOutput:
+@_stage(
+    tables.PROBE_BASELINES,  # on the machine, since the output margin needs the model's head
+    code="2",
+    parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED, need="none"), probing_settings],
+    kinds=["parquet", "scikitlearn"],
+    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
+)
+def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return the probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
     from traps_pipeline.mechanism.baselines import baseline_rows
 
     return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
-
-
-probe_baselines = stage(
-    PROBE_BASELINES,
-    _make_baselines,
-    group=GROUP,
-    code="2",
-    parents=[
-        of(hidden_states, by_extraction, need="some"),
-        of(probe_items, EVERY),
-        of(verdicts, ANSWERED, need="none"),
-        probing_settings,
-    ],
-    scheme=EXTRACTION,
-    kinds=["parquet", "scikitlearn"],
-    cost="machine",  # the output margin needs the model's head
-    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
-)
-
-
-def _make_gate(workspace: Workspace, key: str) -> StageOutput:
-    """Return the model's figures before and after a probe on its states has turned answers into abstentions, beside
-    gates on raw inputs, on the output margin and with shuffled labels."""
-    from traps_pipeline.mechanism.gating import gate_rows
-
-    return StageOutput(gate_rows(workspace, *_examined(workspace, key)))
-
-
-def _make_curves(workspace: Workspace, key: str) -> StageOutput:
-    """Return risk against coverage as gates give up answers, over the four datasets."""
-    from traps_pipeline.mechanism.gating import curve_rows
-
-    return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
 
 
 def _gated(partitions: StudyPartitions, key: str) -> bool:
@@ -125,74 +87,49 @@ def _gated(partitions: StudyPartitions, key: str) -> bool:
     return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in asked for r in PROMPTING)
 
 
-_ASKED = (*DATASETS, *PROBED_ARMS)
-_GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in PROMPTING])
-_stage_of_gates = partial(
-    stage,
-    group=GROUP,
+_gates = partial(
+    _stage,
     code="2",
-    parents=[
-        of(hidden_states, by_extraction, need="some"),
-        of(probe_items, EVERY),
-        of(probes, SAME),
-        of(verdicts, _GATED, need="some"),
-        probing_settings,
-    ],
-    scheme=EXTRACTION,
+    parents=[_STATES, of(probe_items, EVERY), of(probes, SAME), of(verdicts, _GATED, need="some"), probing_settings],
     wants=_gated,
-    cost="machine",
 )
-gate = _stage_of_gates(GATE, _make_gate)
-risk_coverage = _stage_of_gates(RISK_COVERAGE, _make_curves)
 
 
-def _make_lens(workspace: Workspace, key: str) -> StageOutput:
+@_gates(tables.GATE)
+def gate(workspace: Workspace, key: str) -> StageOutput:
+    """Return the model's figures before and after a probe on its states has turned answers into abstentions, beside
+    gates on raw inputs, on the output margin and with shuffled labels."""
+    from traps_pipeline.mechanism.gating import gate_rows
+
+    return StageOutput(gate_rows(workspace, *_examined(workspace, key)))
+
+
+@_gates(tables.RISK_COVERAGE)
+def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
+    """Return risk against coverage as gates give up answers, over the four datasets."""
+    from traps_pipeline.mechanism.gating import curve_rows
+
+    return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
+
+
+@_stage(tables.LENS, parents=[_STATES, probing_settings])
+def lens(workspace: Workspace, key: str) -> StageOutput:
     """Return the output margin of stored states at every layer, through the model's final norm and head."""
     from traps_pipeline.mechanism.lens import lens_rows
 
     return StageOutput(lens_rows(workspace, *_examined(workspace, key)))
 
 
-lens = stage(
-    LENS,
-    _make_lens,
-    group=GROUP,
-    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
-    scheme=EXTRACTION,
-    cost="machine",
+@_stage(
+    tables.ITEM_SCORES,
+    parents=[_STATES, of(probes, SAME), of(verdicts, _GATED, need="none"), probing_settings],
+    wants=_gated,
 )
-
-
-def _make_item_scores(workspace: Workspace, key: str) -> StageOutput:
-    """Return what states and output say of each item, by probes that have not seen its scenario, beside its
-    verdicts.
-    """
+def item_scores(workspace: Workspace, key: str) -> StageOutput:
+    """Return what states and output say of each item, by probes that have not seen its scenario, beside verdicts."""
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
-
-
-item_scores = stage(
-    ITEM_SCORES,
-    _make_item_scores,
-    group=GROUP,
-    parents=[
-        of(hidden_states, by_extraction, need="some"),
-        of(probes, SAME),
-        of(verdicts, _GATED, need="none"),
-        probing_settings,
-    ],
-    scheme=EXTRACTION,
-    cost="machine",
-    wants=_gated,
-)
-
-
-def _make_sentences(workspace: Workspace, key: str) -> StageOutput:
-    """Return how likely whole abstentions are to a model behind every item, beside its own answers."""
-    from traps_pipeline.mechanism.sentences import sentence_rows
-
-    return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
 
 
 def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
@@ -201,51 +138,45 @@ def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
     return partitions.reads_sentences and (extraction.model, extraction.prompt) in asked
 
 
-sentences = stage(
-    SENTENCES,
-    _make_sentences,
-    group=GROUP,
+@_stage(
+    tables.SENTENCES,
     parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
-    scheme=EXTRACTION,
-    cost="machine",
     wants=_read_in_sentences,
 )
+def sentences(workspace: Workspace, key: str) -> StageOutput:
+    """Return how likely whole abstentions are to a model behind every item, beside its own answers."""
+    from traps_pipeline.mechanism.sentences import sentence_rows
+
+    return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
 
 
-def _make_patching(workspace: Workspace, key: str) -> StageOutput:
-    """Return indirect effects of groups of positions between matched controls and voids, at every layer, beside
-    nulls.
-    """
+@_stage(
+    tables.PATCHING,
+    parents=[of(probe_items, EVERY, need="some"), patching_settings],
+    wants=lambda wanted, key: wanted.patches and Extraction.parse(key).prompt == PROBE_PROMPT,
+    kinds=["parquet", "pytorch"],
+)
+def patching(workspace: Workspace, key: str) -> StageOutput:
+    """Return indirect effects of groups of positions between matched controls and voids by layer, beside nulls."""
     from traps_pipeline.mechanism.patched import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
 
 
-patching = stage(
-    PATCHING,
-    _make_patching,
-    group=GROUP,
-    parents=[of(probe_items, EVERY, need="some"), patching_settings],
-    scheme=EXTRACTION,
-    wants=lambda wanted, key: wanted.patches and Extraction.parse(key).prompt == PROBE_PROMPT,
-    kinds=["parquet", "pytorch"],
-    cost="machine",
-)
+_of_effects = partial(stage, group=GROUP, parents=[steering_effects], wants=steers)
 
 
-def _make_nulls(workspace: Workspace, _: None) -> StageOutput:
+@_of_effects(tables.STEERING_NULLS)
+def steering_nulls(workspace: Workspace, _: None) -> list[tables.SteeringNullRow]:
     """Return the effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
     from traps_pipeline.mechanism.nulls import null_rows
 
-    return made_of("nulls", STEERING_NULLS, null_rows(workspace.tables.read(STEERING_EFFECTS, {})))
+    return null_rows(workspace.tables.read(STEERING_EFFECTS, {}))
 
 
-def _make_steering_pecs(workspace: Workspace, _: None) -> StageOutput:
+@_of_effects(tables.STEERING_PECS)
+def steering_pecs(workspace: Workspace, _: None) -> list[tables.SteeringPecsRow]:
     """Return PECS of the steered model under each sign policy, with the share of degenerate answers."""
     from traps_pipeline.mechanism.nulls import pecs_rows
 
-    return made_of("pecs", STEERING_PECS, pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})))
-
-
-steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, parents=[steering_effects], wants=steers)
-steering_pecs = stage(STEERING_PECS, _make_steering_pecs, group=GROUP, parents=[steering_effects], wants=steers)
+    return pecs_rows(workspace.tables.read(STEERING_EFFECTS, {}))

@@ -1,100 +1,82 @@
 """The judging group: agreement of the panel, bias of its judges, and confabulation in void failures."""
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
+from traps_pipeline.judging.confabulation import collect_labels, load_protocol, protocol_digest
 from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
+from traps_pipeline.models.judges import load_panel, panel_id
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
 from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
-from traps_pipeline.pipeline.stages.tables_shown import made_of
+from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
+from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
     import pandas as pd
 
-GROUP = "judging"
+_stage, _source = partial(stage, group="judging"), partial(source, group="judging")
 
 
-def _validation_version(workspace: Workspace, key: None) -> str:
+@_source(kinds=["yaml"])
+def confabulation_protocol(workspace: Workspace, _: None) -> str:
+    """assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels."""
+    return protocol_digest(workspace.study.panel)
+
+
+@_source(kinds=["parquet"])
+def judge_validation(workspace: Workspace, _: None) -> str:
+    """The comparison of the judge with two annotators, which `traps people validate` writes."""
     state = workspace.tables.state(JUDGE_VALIDATION, {})
     return state.version if state else "not run"
 
 
-confabulation_protocol = source(
-    "confabulation_protocol",
-    lambda workspace, key: protocol_digest(workspace.study.panel),
-    group=GROUP,
-    doc="assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels.",
-    kinds=["yaml"],
-)
-judge_validation = source(
-    "judge_validation",
-    _validation_version,
-    group=GROUP,
-    doc="The comparison of the judge with two annotators, which `traps people validate` writes.",
-    kinds=["parquet"],
-)
-_SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
-
-
 def _panel(workspace: Workspace) -> list[str]:
-    from traps_pipeline.models.judges import load_panel
-
     return [judge.id for judge in load_panel(workspace.study.panel)]
 
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     """Return the votes of the study's panel as it is now. Raises TrapsError if there is none."""
-    from traps_pipeline.judging.verdicts import current
-    from traps_pipeline.models.judges import panel_id
-    from traps_pipeline.protocol.ratings import VOTE_COLUMNS
-
-    votes = current(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
-    votes = votes.loc[votes["panel"] == panel_id(workspace.study.panel)]
-    if votes.empty:
+    cast = current_rows(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
+    cast = cast.loc[cast["panel"] == panel_id(workspace.study.panel)]
+    if cast.empty:
         raise TrapsError(f"{name}: no votes yet; materialize votes for a cell first")
-    return votes
+    return cast
 
 
-def _make_agreement(workspace: Workspace, _: None) -> StageOutput:
-    """Return agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
-    Krippendorff."""
-    from traps_pipeline.judging.agreement import agreement
-
-    return made_of("agreement", AGREEMENT, agreement(_votes(workspace, "agreement"), _panel(workspace)))
+_VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 
-def _make_judge_bias(workspace: Workspace, _: None) -> StageOutput:
+@_stage(AGREEMENT, parents=_VOTED)
+def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
+    """Return agreement of the panel and any two judges by dataset and task: unanimity, Fleiss, Cohen, Krippendorff."""
+    from traps_pipeline.judging.agreement import agreement as rows_of
+
+    return rows_of(_votes(workspace, "agreement"), _panel(workspace))
+
+
+@_stage(JUDGE_BIAS, parents=_VOTED)
+def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return each judge's rate of yes against the panel's majority, per dataset and task."""
-    from traps_pipeline.judging.agreement import judge_bias
+    from traps_pipeline.judging.agreement import judge_bias as rows_of
 
-    return made_of("judge bias", JUDGE_BIAS, judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
+    return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
 
 
-def _make_leave_one_out(workspace: Workspace, _: None) -> StageOutput:
+@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard])
+def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return PECS by the votes of two judges, for each judge that is left out."""
-    from traps_pipeline.judging.verdicts import current
-    from traps_pipeline.scoring.leave_one_out import leave_one_out
+    from traps_pipeline.scoring.leave_one_out import leave_one_out as rows_of
 
     cast, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
-    return made_of(
-        "leave one out", LEAVE_ONE_OUT, leave_one_out(current(workspace, VERDICTS), cast, board, _panel(workspace))
-    )
-
-
-def _make_confabulation(workspace: Workspace, _: None) -> StageOutput:
-    """Return void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no
-    such judge."""
-    from traps_pipeline.judging.confabulation import collect_labels
-
-    return collect_labels(workspace)
+    return rows_of(current_rows(workspace, VERDICTS), cast, board, _panel(workspace))
 
 
 def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
@@ -103,23 +85,11 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
 
 
-def _make_prevalence(workspace: Workspace, _: None) -> StageOutput:
-    """Return how often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
-    from traps_pipeline.scoring.prevalence import prevalence
-
-    return made_of("prevalence", CONFABULATION_PREVALENCE, prevalence(workspace.tables.read(CONFABULATION, {})))
+_SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
 
 
-_VOTED = (of(items, need="some"), of(votes, need="some"), judges)
-agreement = stage(AGREEMENT, _make_agreement, group=GROUP, parents=_VOTED)
-judge_bias = stage(JUDGE_BIAS, _make_judge_bias, group=GROUP, parents=_VOTED)
-leave_one_out = stage(
-    LEAVE_ONE_OUT, _make_leave_one_out, group=GROUP, parents=[*_VOTED, of(verdicts, need="some"), leaderboard]
-)
-confabulation = stage(
+@_stage(
     CONFABULATION,
-    _make_confabulation,
-    group=GROUP,
     parents=[
         of(items, need="none"),
         of(responses, _SAMPLED, need="none"),
@@ -137,4 +107,15 @@ confabulation = stage(
         )
     ],
 )
-confabulation_prevalence = stage(CONFABULATION_PREVALENCE, _make_prevalence, group=GROUP, parents=[confabulation])
+def confabulation(workspace: Workspace, _: None) -> StageOutput:
+    """Return void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no
+    such judge."""
+    return collect_labels(workspace)
+
+
+@_stage(CONFABULATION_PREVALENCE, parents=[confabulation])
+def confabulation_prevalence(workspace: Workspace, _: None) -> "pd.DataFrame":
+    """Return how often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
+    from traps_pipeline.scoring.prevalence import prevalence
+
+    return prevalence(workspace.tables.read(CONFABULATION, {}))

@@ -1,9 +1,11 @@
 """The mechanism group: hidden states of local models, probes, void directions, steering (docs/spec.md 7 and 8)."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.mechanism import probing_versions as versions
 from traps_pipeline.mechanism.mechanism_rows import (
     COSINES,
     DIRECTIONS,
@@ -13,18 +15,15 @@ from traps_pipeline.mechanism.mechanism_rows import (
     STEERING_EFFECTS,
     STEERING_SHARES,
     STEERING_VOTES,
+    CosineRow,
     ProbeRow,
+    SteeringEffectRow,
+    SteeringShareRow,
 )
 from traps_pipeline.mechanism.mechanism_rows import STEERING as STEERING_TABLE
-from traps_pipeline.mechanism.probing_versions import (
-    directions_are_there,
-    extraction_version,
-    probing_version,
-    states_are_there,
-    steering_version,
-)
 from traps_pipeline.models.registry import local_models
-from traps_pipeline.pipeline.graph import Check, Collect, RunResources
+from traps_pipeline.pipeline import schemes
+from traps_pipeline.pipeline.graph import Check, RunResources
 from traps_pipeline.pipeline.partitioning import EVERY
 from traps_pipeline.pipeline.schemes import (
     CATEGORY,
@@ -32,19 +31,14 @@ from traps_pipeline.pipeline.schemes import (
     DATASET,
     EXTRACTION,
     PROBED,
-    STATES,
-    STEERED,
-    STEERING,
     by_dataset,
     by_extraction,
-    by_steering,
     these_keys,
     to_keys,
 )
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.pipeline.stages.tables_shown import made_of
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
@@ -55,33 +49,28 @@ if TYPE_CHECKING:
     import pandas as pd
 
 GROUP = "mechanism"
-extraction_settings = source(
-    "extraction_settings",
-    lambda workspace, key: extraction_version(workspace, Extraction.parse(key)),
-    group=GROUP,
-    doc="The inputs of hidden states besides items: checkpoint, precision, prompt.",
-    kinds=["yaml"],
-    scheme=EXTRACTION,
-)
-probing_settings = source(
-    "probing_settings",
-    lambda workspace, key: probing_version(workspace, Extraction.parse(key)),
-    group=GROUP,
-    doc="The study's settings of probes and directions, by model.",
-    kinds=["yaml"],
-    scheme=EXTRACTION,
-)
-steering_settings = source(
-    "steering_settings",
-    steering_version,
-    group=GROUP,
-    doc="The study's settings of steering, the model and its prompt.",
-    kinds=["yaml"],
-    scheme=STEERED,
-)
+_stage, _source = partial(stage, group=GROUP), partial(source, group=GROUP, kinds=["yaml"])
 # Cells in which the local models answered under Standard in run 1: their verdicts say what the models confabulated on.
 ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
+
+
+@_source(scheme=EXTRACTION)
+def extraction_settings(workspace: Workspace, key: str) -> str:
+    """The inputs of hidden states besides items: checkpoint, precision, prompt."""
+    return versions.extraction_version(workspace, Extraction.parse(key))
+
+
+@_source(scheme=EXTRACTION)
+def probing_settings(workspace: Workspace, key: str) -> str:
+    """The study's settings of probes and directions, by model."""
+    return versions.probing_version(workspace, Extraction.parse(key))
+
+
+@_source(scheme=schemes.STEERED)
+def steering_settings(workspace: Workspace, key: str) -> str:
+    """The study's settings of steering, the model and its prompt."""
+    return versions.steering_version(workspace, key)
 
 
 def _probed_from(dataset: str) -> list[str]:
@@ -93,18 +82,8 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
     return partitions.steers
 
 
-def _make_probe_items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with
-    a question that they answer, and chaotic's clips with the frame times of the other side."""
-    from traps_pipeline.mechanism.probe_items import probe_items as rows_of
-
-    return StageOutput(rows_of(workspace, dataset))
-
-
-probe_items = stage(
+@_stage(
     PROBE_ITEMS,
-    _make_probe_items,
-    group=GROUP,
     code="2",
     parents=[
         of(items, to_keys(DATASET, PROBED, _probed_from)),
@@ -113,16 +92,12 @@ probe_items = stage(
     ],
     scheme=PROBED,
 )
+def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
+    """Return clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with
+    a question that they answer, and chaotic's clips with the frame times of the other side."""
+    from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
-
-def _make_hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Return hidden states of a frozen local model at every layer, one row per item; only missing states are
-    extracted.
-    """
-    from traps_pipeline.mechanism.stages import extract_states
-
-    rows, new = extract_states(workspace, StatesCell.parse(key))
-    return StageOutput(rows, Tally(asked=new), {"extracted": new})
+    return StageOutput(rows_of(workspace, dataset))
 
 
 def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) -> list[int]:
@@ -131,28 +106,25 @@ def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) 
     return unsound_layers(workspace, StatesCell.parse(str(key)), output.rows(HIDDEN_STATES)[0].n_layers)
 
 
-hidden_states = stage(
+def _lost_states(workspace: Workspace, key: str) -> list[str]:
+    return [] if versions.states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"]
+
+
+@_stage(
     HIDDEN_STATES,
-    _make_hidden_states,
-    group=GROUP,
-    parents=[
-        of(probe_items, by_dataset),
-        of(extraction_settings, by_extraction),
-    ],
-    scheme=STATES,
+    parents=[of(probe_items, by_dataset), of(extraction_settings, by_extraction)],
+    scheme=schemes.STATES,
     kinds=["parquet", "pytorch"],
     cost="machine",
-    lost=lambda workspace, key: [] if states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"],
+    lost=_lost_states,
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
+def hidden_states(workspace: Workspace, key: str) -> StageOutput:
+    """Return a frozen local model's hidden states at every layer, one row per item; only missing ones are extracted."""
+    from traps_pipeline.mechanism.stages import extract_states
 
-
-def _make_probes(workspace: Workspace, key: str) -> StageOutput:
-    """Return probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled,
-    centroids."""
-    from traps_pipeline.mechanism.stages import probe_rows
-
-    return StageOutput(probe_rows(workspace, Extraction.parse(key)))
+    rows, new = extract_states(workspace, StatesCell.parse(key))
+    return StageOutput(rows, Tally(asked=new), {"extracted": new})
 
 
 def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) -> str:
@@ -164,63 +136,64 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     return f"{wrong} rows are wrong" if wrong else ""
 
 
-probes = stage(
+@_stage(
     PROBES,
-    _make_probes,
-    group=GROUP,
     code="3",
-    parents=[
-        of(hidden_states, by_extraction, need="some"),
-        of(verdicts, ANSWERED, need="none"),
-        probing_settings,
-    ],
+    parents=[of(hidden_states, by_extraction, need="some"), of(verdicts, ANSWERED, need="none"), probing_settings],
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
     takes=RunResources(memory_gb=1.0, each_gb=0.5),
     wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
+def probes(workspace: Workspace, key: str) -> StageOutput:
+    """Return probes of every dataset on every other by layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
+    from traps_pipeline.mechanism.stages import probe_rows
+
+    return StageOutput(probe_rows(workspace, Extraction.parse(key)))
 
 
-def _make_directions(workspace: Workspace, key: str) -> StageOutput:
+def _lost_directions(workspace: Workspace, key: str) -> list[str]:
+    return [] if versions.directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
+
+
+@_stage(
+    DIRECTIONS,
+    code="3",
+    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
+    scheme=EXTRACTION,
+    wants=steers,
+    lost=_lost_directions,
+)
+def directions(workspace: Workspace, key: str) -> StageOutput:
     """Return the void direction of every dataset at every layer, with draws of its nulls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
 
     return StageOutput(direction_rows(workspace, Extraction.parse(key)))
 
 
-directions = stage(
-    DIRECTIONS,
-    _make_directions,
-    group=GROUP,
-    code="3",
-    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
-    scheme=EXTRACTION,
-    wants=steers,
-    lost=lambda workspace, key: (
-        [] if directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
-    ),
-)
-
-
-def _make_cosines(workspace: Workspace, _: None) -> StageOutput:
+@_stage(COSINES, code="2", parents=[of(directions, need="some"), of(hidden_states, need="some")], wants=steers)
+def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
     """Return cosines of every two void directions of a model at one layer, with their reliability."""
     from traps_pipeline.mechanism.cosines import cosine_rows
 
-    return made_of("cosines", COSINES, cosine_rows(workspace))
+    return cosine_rows(workspace)
 
 
-cosines = stage(
-    COSINES,
-    _make_cosines,
-    group=GROUP,
-    code="2",
-    parents=[of(directions, need="some"), of(hidden_states, need="some")],
-    wants=steers,
+@_stage(
+    STEERING_TABLE,
+    code="4",
+    parents=[
+        of(items, by_dataset),
+        of(directions, EVERY, need="some"),
+        of(steering_settings, schemes.by_steering),
+    ],
+    scheme=schemes.STEERING,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+    side_by_side=True,
 )
-
-
-def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
+def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Yield answers of a model that is steered along every path into a dataset; answers in the ledger are not asked
     again."""
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
@@ -234,41 +207,20 @@ def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tup
             yield done.key, output
 
 
-steering = stage(
-    STEERING_TABLE,
-    Collect(_collect_steering),
-    group=GROUP,
-    code="4",
-    parents=[
-        of(items, by_dataset),
-        of(directions, EVERY, need="some"),
-        of(steering_settings, by_steering),
-    ],
-    scheme=STEERING,
-    kinds=["parquet", "pytorch"],
-    cost="machine",
+@_stage(
+    STEERING_VOTES,
+    code="3",
+    parents=[of(items, by_dataset), steering, judges],
+    scheme=schemes.STEERING,
+    cost="money",
+    side_by_side=True,
 )
-
-
-def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield the votes of the study's panel on whether each steered answer abstains, and whether a control's is
-    correct.
-    """
+def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
+    """Yield the panel's votes on whether each steered answer abstains, and whether a control's is correct."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for done, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
         yield done.key, output
-
-
-steering_votes = stage(
-    STEERING_VOTES,
-    Collect(_collect_steering_votes),
-    group=GROUP,
-    code="3",
-    parents=[of(items, by_dataset), steering, judges],
-    scheme=STEERING,
-    cost="money",
-)
 
 
 def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
@@ -278,22 +230,20 @@ def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)
 
 
-def _make_effects(workspace: Workspace, _: None) -> StageOutput:
+_ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
+
+
+@_stage(STEERING_EFFECTS, code="3", parents=_ABOVE, wants=steers)
+def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
-    return made_of("effects", STEERING_EFFECTS, effect_rows(*_judged(workspace)))
+    return effect_rows(*_judged(workspace))
 
 
-def _make_shares(workspace: Workspace, _: None) -> StageOutput:
+@_stage(STEERING_SHARES, code="4", parents=_ABOVE, wants=steers)
+def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
     """Abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows
 
-    return made_of("shares", STEERING_SHARES, share_rows(*_judged(workspace)))
-
-
-_ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="3", parents=_ABOVE, wants=steers)
-
-
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="4", parents=_ABOVE, wants=steers)
+    return share_rows(*_judged(workspace))

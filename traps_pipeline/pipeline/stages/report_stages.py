@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from traps_pipeline.pipeline.graph import Parent
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.pipeline.previews import Markdown
@@ -13,7 +15,7 @@ from traps_pipeline.pipeline.stages import (
     people_stages,
     scoring_stages,
 )
-from traps_pipeline.report.catalogue import FIGURES, TABLES
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, TABLE_REPORTS
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
@@ -24,17 +26,22 @@ READ = (judging_stages, people_stages, mechanism_stages, inside_stages, scoring_
 NAMES = 12  # of pieces in an event
 SCORES = ("leaderboard", "robust", "human_row", "panel_errors")  # on the page and in the explorer
 ANSWERS = ("items", "videos", "responses", "votes", "verdicts")
-
-published = source(
-    "published",
-    lambda workspace, key: published_digest(),
-    group=GROUP,
-    doc="assets/published: the paper's tables as printed.",
-    kinds=["csv"],
-)
+_REPORTED = [name for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for name in report.reads]
+_stage = partial(stage, group=GROUP, kinds=["html"])
 
 
-def _report_page(workspace: Workspace, _: None) -> StageOutput:
+@source(group=GROUP, kinds=["csv"])
+def published(workspace: Workspace, _: None) -> str:
+    """assets/published: the paper's tables as printed."""
+    return published_digest()
+
+
+def _parents(*names: str) -> list[Parent]:
+    return [of(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
+
+
+@_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
+def report_page(workspace: Workspace, _: None) -> StageOutput:
     """Return findings, leaderboard, figures and tables beside the paper's on one page that opens from disk; every
     number is a link into the explorer. A table or figure is made again only when a table that it reads changed."""
     from traps_pipeline.report.cards import Card, Sources
@@ -54,7 +61,8 @@ def _report_page(workspace: Workspace, _: None) -> StageOutput:
     return StageOutput(files, shown=shown)
 
 
-def _site(workspace: Workspace, _: None) -> StageOutput:
+@_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))
+def site(workspace: Workspace, _: None) -> StageOutput:
     """Return the explorer: all answers with their votes and clips, on pages that open from disk."""
     from traps_pipeline.report.explorer.site import site_files
 
@@ -62,23 +70,3 @@ def _site(workspace: Workspace, _: None) -> StageOutput:
     data = workspace.store.below(workspace.reports / "data", "*.js")
     workspace.store.remove({*data} - {workspace.reports / name for name in files})
     return StageOutput(files)
-
-
-def _parents(*names: str) -> list[Parent]:
-    return [of(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
-
-
-report_page = stage(
-    "report_page",
-    _report_page,
-    group=GROUP,
-    parents=_parents(*ANSWERS, "arms", *SCORES, *(r for each in (*TABLES, *FIGURES) for r in each.reads), "published"),
-    kinds=["html"],
-)
-site = stage(
-    "site",
-    _site,
-    group=GROUP,
-    parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"),
-    kinds=["html"],
-)

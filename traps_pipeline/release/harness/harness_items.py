@@ -13,9 +13,7 @@ ITEMS, ABOUT, MEDIA = "items.jsonl", "about.json", "media"
 
 @cache
 def about() -> dict[str, Any]:
-    """Return name, version and canary of the benchmark, prompts by regime, and the parameters that the protocol
-    sends.
-    """
+    """Return name, version and canary of the benchmark, prompts by regime, and the protocol's parameters."""
     return json.loads((FOLDER / ABOUT).read_text(encoding="utf-8"))
 
 

@@ -7,14 +7,7 @@ from typing import Any
 
 from inspect_ai import Task, task
 from inspect_ai.dataset import MemoryDataset, Sample
-from inspect_ai.model import (
-    ChatMessageSystem,
-    ChatMessageUser,
-    ContentImage,
-    ContentText,
-    ContentVideo,
-    GenerateConfig,
-)
+from inspect_ai.model import ChatMessageSystem, ChatMessageUser, ContentImage, ContentText, ContentVideo, GenerateConfig
 from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
@@ -31,9 +24,7 @@ def traps(regime: str = "standard") -> Any:
 
 
 def evaluation(regime: str) -> Any:
-    """Return all items under one regime, once: a further run is a further evaluation, so that PECS is computed per
-    run.
-    """
+    """Return all items under one regime, once: a further run is a further evaluation, as PECS is per run."""
     system = prompt(regime)
     samples = [
         Sample(

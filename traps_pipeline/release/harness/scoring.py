@@ -18,7 +18,7 @@ DATASETS = (
     "occlusion",
     "occlusion_ill_posed",
 )  # in the order in which means are summed
-FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
+RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
     by_dataset = {name: _of_dataset([row for row in rows if row.dataset == name]) for name in DATASETS}
     for name, own in by_dataset.items():
         if any(row.dataset == name for row in rows):
-            results |= {f"{name}_{figure}": own[figure] for figure in FIGURES}
-    for figure in FIGURES:
+            results |= {f"{name}_{figure}": own[figure] for figure in RUN_FIGURES}
+    for figure in RUN_FIGURES:
         values = [own[figure] for own in by_dataset.values()]
         decided = [value for value in values if value is not None]
         results[figure] = sum(decided) / len(DATASETS) if len(decided) == len(DATASETS) else None

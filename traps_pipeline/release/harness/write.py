@@ -43,11 +43,7 @@ SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
 
 
 def shown(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
-    """Return what a harness shows of a clip: the protocol's 25 frames, or evenly spaced ones as an entry's `media` has
-    them.
-
-    Raises TrapsError for a video of evenly spaced frames, which would play at no constant rate.
-    """
+    """Return what is shown of a clip: the protocol's 25 frames, or evenly spaced ones. Raises TrapsError."""
     if uniform is None:
         return SHOWN[media]
     if media == "video":

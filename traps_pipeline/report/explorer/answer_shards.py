@@ -80,8 +80,7 @@ class StudyAnswers:
 
 
 def study_items(workspace: Workspace) -> pd.DataFrame:
-    """Return ITEMS rows with the column `family`: datasets in the benchmark's order, then by family, scenario and side.
-    Raises TrapsError where there are none."""
+    """Return ITEMS rows with `family`, datasets in the benchmark's order. Raises TrapsError where there are none."""
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
@@ -95,8 +94,7 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 
 
 def study_answers(workspace: Workspace) -> StudyAnswers:
-    """Return all answers to items that are still in the benchmark, with their decisions and votes. Raises TrapsError
-    where the study has no items."""
+    """Return all answers to current items, with decisions and votes. Raises TrapsError without items."""
     items = study_items(workspace)
     responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)
@@ -154,8 +152,7 @@ def _evaluations(responses: pa.Table) -> list[Evaluation]:
 
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
-    """Return the rows with `key`: their item's place times the number of evaluations, plus their evaluation's place.
-    Rows of an evaluation without answers are left out."""
+    """Return the rows with `key`, the place of item and evaluation; without those of evaluations without answers."""
     place = {(e.model, e.regime, e.run): k for k, e in enumerate(evaluations)}
     columns = [rows[name].combine_chunks().dictionary_encode() for name in _EVALUATION]
     sizes = [len(column.dictionary) for column in columns]

@@ -1,13 +1,14 @@
 """The explorer: a folder that opens from disk or from any web host, on which people find and look at answers.
 
-`index.html` has one classic script; all data are script files (`scripts`), clips have relative paths. The page makes no
-request that leaves the folder: its content policy forbids it. Figures come from the study's tables; the page counts
-decisions and computes no metric.
+`index.html` has one classic script; all data are script files, which a page that was opened from disk may load where it
+may not fetch; clips have relative paths. No request leaves the folder: the content policy forbids it. Figures come from
+the study's tables; the page counts decisions and computes no metric.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -17,6 +18,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
@@ -28,7 +32,6 @@ from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.explorer.scripts import data_script, parquet_text
 from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import said_by_people
@@ -55,6 +58,7 @@ _ITEM_COLUMNS = (
     *("dataset", "scenario_id", "pair_id", "side", "category", "family", "sub_scenario", "question", "ground_truth"),
     *("control_answer", "answer_type", "clip"),
 )
+_PAGE_BYTES = 1 << 24  # a column of a shard is one page, since what repeats in it is then stored once
 _PUBLISHED = ("acc", "abs_rec", "false_abs", "pecs")
 
 
@@ -110,8 +114,7 @@ def _files(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str], clips_at: str, *,
     report: bool,
 ) -> dict[str, bytes]:  # fmt: skip
-    """Return the files by path, the index last. clips: those that can be played; clips_at: the folder that holds
-    `clips`."""
+    """Return the files by path, the index last. clips: those that can be played, below the folder clips_at."""
     contents = _contents(workspace, answers, scenarios, clips)
     stamp = _digest(contents)
     files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
@@ -257,9 +260,7 @@ def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the clips that the pages show, as the tables name them. A name that leads out of the folder is left
-    out.
-    """
+    """Return the clips that the pages show, without names that lead out of the folder."""
     named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
     return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
 
@@ -279,11 +280,7 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """Return the one script: the bundled libraries with their licences, then our sources, which share one function's
-    scope.
-
-    Raises TrapsError where the bundle is not the one that was checked in.
-    """
+    """Return the one script: bundled libraries, then our sources. Raises TrapsError for another bundle than ours."""
     library = LIBRARY.read_bytes()
     wanted = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
     if hashlib.sha256(library).hexdigest() != wanted:
@@ -306,3 +303,24 @@ def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: 
         title=f"{load_release().name}: {workspace.study.name}", version=stamp, style=style, style_digest=digest,
         script=SCRIPT, data=DATA, clips_at=clips_at, report=REPORT if report else "",
     )  # fmt: skip
+
+
+def parquet_text(table: pa.Table, level: int = 9) -> str:
+    """Return a table as a Parquet file (zstd) in base64."""
+    stream = io.BytesIO()
+    pq.write_table(
+        table.replace_schema_metadata(None), stream, compression="zstd", compression_level=level,
+        data_page_size=_PAGE_BYTES, dictionary_pagesize_limit=_PAGE_BYTES, row_group_size=max(len(table), 1),
+        write_statistics=False, store_schema=False,
+    )  # fmt: skip
+    return b64encode(stream.getvalue()).decode("ascii")
+
+
+def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
+    """Return the script of one data file, which calls the page's `TRAPS_DATA`.
+
+    version: of the whole site, as a page must not mix files of two. content: JSON values; Parquet is `parquet_text`.
+    """
+    # "<" cannot close a script element, should a host inline the file; JSON knows the escape.
+    body = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f"TRAPS_DATA({json.dumps(name)},{json.dumps(version)},{body});\n".encode()

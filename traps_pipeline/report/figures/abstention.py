@@ -11,16 +11,7 @@ from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
-from traps_pipeline.report.writing import (
-    COLUMN_IN,
-    INK,
-    PAGE_IN,
-    SOFT,
-    NotRun,
-    figure_style,
-    new_figure,
-    plain,
-)
+from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
@@ -62,9 +53,7 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
-    """Return whether a row has both rates of its model pooled over taxonomies, or those of the one that it was
-    asked.
-    """
+    """Return whether a row has a model's rates pooled over taxonomies, or those of the only one it was asked."""
     models = rates.loc[rates["taxonomy"] == "pooled", "model"]
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
 
@@ -176,10 +165,9 @@ def _no_doubt(results: Results) -> str:
 
 
 def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
-    """Return the columns thinking, other, dataset, doubt, gain (fractions), one row per pair and dataset; and the
-    reasons why pairs were refused.
+    """Return thinking, other, dataset, doubt, gain (fractions) by pair and dataset; and why pairs were refused.
 
-    AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (docs/spec.md 9.2).
+    AbsRec is that of `results.rates` (standard), whose epoch must be that of the labels (docs/spec.md 9.2).
     """
     import pandas as pd
 

@@ -61,8 +61,7 @@ def states_and_output(results: Results) -> Figure:
 
 
 def scored_items(results: Results) -> pd.DataFrame:
-    """Return the items of which both a score of states and an output margin are known, with `sentence`: how much
-    likelier an abstention is than the model's own answer under standard, nats a token (NaN where it was not read)."""
+    """Return the items with both scores, and `sentence`: how much likelier an abstention is (nats a token, or NaN)."""
     rows, read = results.item_scores, results.sentences
     read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
     read = read.assign(sentence=read["abstention"].astype(float) - read["own"].astype(float))

@@ -1,4 +1,4 @@
-"""Heatmaps over sub-scenarios, bars over the axes of confabulation."""
+"""Heatmaps over sub-scenarios, bars over the axes of confabulation, points of cues."""
 
 from __future__ import annotations
 
@@ -8,9 +8,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.models.registry import load_models
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
+from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.writing import (
+    COLOURS,
+    COLUMN_IN,
+    MARKERS,
+    PAGE_IN,
+    SOFT,
+    NotRun,
+    figure_style,
+    new_figure,
+    plain,
+)
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
@@ -140,4 +152,27 @@ def confabulation(results: Results) -> Figure:
         axes.set_xticks(at, names)
         axes.set(ylim=(0, 112), yticks=(0, 25, 50, 75, 100), ylabel="void failures, %")
         figure.legend(loc="outside upper center", ncols=5)
+    return figure
+
+
+def shortcut_figure(table: pd.DataFrame) -> Figure:
+    """Return how well each cue alone predicts the side, from `benchmark.shortcuts`; a line is at chance."""
+    datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
+    cues = list(dict.fromkeys(table["cue"]))
+    with figure_style():
+        figure = new_figure(COLUMN_IN, 0.75 + 0.42 * len(datasets))
+        axes = figure.add_subplot()
+        axes.axvline(0.5, color="#98a2b3", linewidth=0.8, zorder=0.5)
+        for k, cue in enumerate(cues):
+            rows = table.loc[table["cue"] == cue].set_index("dataset")
+            at = [datasets.index(str(name)) + 0.17 * (k - (len(cues) - 1) / 2) for name in rows.index]
+            axes.errorbar(
+                rows["accuracy"], at, xerr=rows["half_width"], fmt=MARKERS[k], color=COLOURS[k], markersize=4,
+                linestyle="none", linewidth=0.8, label=cue, clip_on=False, zorder=3,
+            )  # fmt: skip
+        axes.set(xlim=(0.38, 1.02), ylim=(len(datasets) - 0.5, -0.5), xlabel="share of sides predicted correctly")
+        axes.set_yticks(range(len(datasets)), [TITLES[name] for name in datasets])
+        if cues:
+            columns = len(cues)
+            figure.legend(loc="outside upper center", ncols=columns, handletextpad=0.1, columnspacing=0.8, fontsize=6)
     return figure

@@ -26,8 +26,7 @@ class Label:
 
 
 def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
-    """Return the labels, with those of coinciding points joined: one name per line, in the given order, in neutral
-    colour."""
+    """Return the labels; those of coinciding points are joined, one name a line, in neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     merged: list[Label] = []
     for label in labels:
@@ -40,10 +39,9 @@ def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
-    """Put every label near its point where it overlaps no marker, no other label and, if possible nearby, no line.
+    """Put every label near its point where it overlaps no marker, no label and, if possible nearby, no line.
 
-    A leader line ties a label to its point if they are apart, or several names stand at one point. markers is (n, 2) in
-    data coordinates. The algorithm is greedy and deterministic: the result depends only on the table.
+    A leader line ties it to its point if they are apart, or several names stand at one. markers: (n, 2), data units.
     """
     from matplotlib.patheffects import withStroke
 
@@ -78,9 +76,7 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
 
 def _offsets() -> np.ndarray:
-    """Return candidate offsets (n, 2) in points of a label from its marker, nearest ring first, sides before
-    diagonals.
-    """
+    """Return candidate offsets (n, 2) in points of a label from its marker, nearest first, sides before diagonals."""
     angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
     rings = np.array([5, 9, 14, 20, 28, 38, 50, 64, 80])
     return np.round(rings[:, None, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 3).reshape(-1, 2)

@@ -13,15 +13,7 @@ from traps_pipeline.report.figures.label_placement import LINES, Label, merged_l
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
-from traps_pipeline.report.writing import (
-    COLUMN_IN,
-    INK,
-    PAGE_IN,
-    NotRun,
-    figure_style,
-    freeze_layout,
-    new_figure,
-)
+from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
@@ -45,11 +37,9 @@ def landscape(results: Results) -> Figure:
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """Return J (x) against Acc (y) of every model with iso-PECS contours, one column wide.
 
-    points has the columns model, regime, acc, j, pecs, incomplete. A hollow marker is standard, a filled one guided, an
-    arrow connects them, and a dot is json; thin bars are 95 % intervals of the named point. The dashed line is the
-    frontier under guided, a ring marks each family's best PECS under guided, and ‡ an incomplete model. The reported
-    PECS is averaged per run and dataset, so it can differ slightly from the contours. Models whose named points
-    coincide (reference strategies) share one label.
+    points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled guided, a dot json; thin
+    bars are 95 % intervals. The dashed line is the frontier under guided, a ring each family's best PECS under guided.
+    PECS is averaged per run and dataset, so it can differ from the contours. Coinciding points share one label.
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
     with figure_style():

@@ -37,8 +37,7 @@ def family_colour(family: str) -> str:
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return colour and marker of each model: its family's colour, and a different marker for up to 13 models of a
-    family."""
+    """Return colour (its family's) and marker of each model; up to 13 models of a family differ in their marker."""
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
@@ -64,9 +63,7 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str) -> None:
 
 
 def _limits(values: pd.Series, low: float, least: float) -> tuple[float, float]:
-    """Return ends of an axis of fractions: tenths around the values, within [low, 1], the upper end at least
-    `least`.
-    """
+    """Return ends of an axis of fractions: tenths around the values, within [low, 1], the upper at least `least`."""
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)

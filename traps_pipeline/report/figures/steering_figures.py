@@ -211,8 +211,7 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Return rows of each model and complete path set, under guided inference with directions of the standard prompt,
-    or the regimes next to them that the model has."""
+    """Return rows of each model and complete path set, of standard directions under guided if the model has them."""
     panels: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "standard").astype(int) + 2 * (of["regime"] == "guided").astype(int)

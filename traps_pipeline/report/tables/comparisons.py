@@ -150,8 +150,7 @@ def naive(results: Results) -> list[PrintedTable]:
 
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
-    """Return cells with PECS 0, in which a model does not distinguish void from control or answers no control
-    correctly."""
+    """Return cells with PECS 0: void is not told from control, or no control is answered correctly."""
     rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
@@ -209,9 +208,7 @@ TOO_FEW = "too few"
 
 
 def contrasts(results: Results) -> list[PrintedTable]:
-    """Return paired contrasts of overall PECS between models of one regime, or regimes of one model; Holm's
-    correction.
-    """
+    """Return paired contrasts of overall PECS, of models under one regime and of regimes of one model (Holm)."""
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
     known = rows["separable"].map({True: "yes", False: "no"}).astype(object)

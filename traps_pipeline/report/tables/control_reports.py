@@ -1,5 +1,4 @@
-"""Controls beside the mechanistic claims: probes beside baselines, directions among their nulls, what steering and the
-gate do to PECS."""
+"""Controls beside the mechanistic claims: baselines of probes, nulls of directions, PECS under steering and gates."""
 
 from __future__ import annotations
 
@@ -45,8 +44,7 @@ WHAT = {
 
 
 def probe_baselines(results: Results) -> list[PrintedTable]:
-    """Return the probe on states beside probes on raw inputs, on the output margin and on noise: on every pair of
-    datasets, and on clips that only look like voids."""
+    """Return the probe on states beside probes on raw inputs, the output margin and noise; also on look-alikes."""
     return [_beside(results), _look_alikes(results)]
 
 
@@ -139,8 +137,7 @@ AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_s
 
 
 def steering_nulls(results: Results) -> list[PrintedTable]:
-    """Return the effect of void directions on their own datasets among nulls of the same length, and PECS of the
-    steered model under each sign policy."""
+    """Return void directions on their own datasets among nulls of their length, and PECS of the steered model."""
     return [_nulls(results), _pecs(results)]
 
 
@@ -221,9 +218,7 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 
 def gate(results: Results) -> list[PrintedTable]:
-    """Return probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on
-    other features; what it does to items that must be answered; and what the guided prompt does to answers and to
-    states."""
+    """Return PECS before and after probe gates, by source, threshold and features; what they and the prompt change."""
     return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
 
 
@@ -242,8 +237,7 @@ _GATE_NOTES = (
 
 
 def _gates(results: Results) -> pd.DataFrame:
-    """Return the rows of gates: those on states first, from the other datasets, at the mid threshold, over all
-    datasets."""
+    """Return the rows of gates: on states first, from other datasets, at the mid threshold, over all datasets."""
     rows = results.gate
     firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
     later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}

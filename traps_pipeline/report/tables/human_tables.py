@@ -96,8 +96,7 @@ def _shown(row: Mapping[Any, Any], field: str) -> str:
 
 
 def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
-    """Return notes beside a leaderboard, from HUMAN_ROW and PANEL_ERRORS rows: what people score, and whether the panel
-    was validated."""
+    """Return notes beside a leaderboard: what people score, and whether the panel was validated."""
     return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
 
 

@@ -26,8 +26,7 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 
 def hypotheses(results: Results) -> list[PrintedTable]:
-    """Return how answers and abstentions change when one thing of the pairs is changed step by step, beside what rules
-    get."""
+    """Return how answers and abstentions change when one thing is changed step by step, beside what rules get."""
     from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]

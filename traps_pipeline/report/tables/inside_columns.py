@@ -24,9 +24,7 @@ FEW_MARK = "†"
 
 
 def why(results: Results, of_paper: str = "") -> str:
-    """Return the reason why a frame of what is found inside models has no rows. of_paper: that of the paper's
-    results.
-    """
+    """Return why a frame of what is found inside models has no rows. of_paper: the reason for the paper's."""
     if of_paper and not results.is_study:
         return of_paper
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
@@ -41,9 +39,7 @@ def few(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
-    """Return the meaning of the mark, if a row has it in one of these columns (default: `mark`). of: what is
-    counted.
-    """
+    """Return the meaning of the mark, if a row has it in one of these columns. of: what is counted."""
     used = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if used else []
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
@@ -69,7 +68,27 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
 
 def per_dataset(results: Results) -> list[PrintedTable]:
     """Return PECS of every model and regime on each dataset, and overall."""
-    return [_by_dataset(results, "per_dataset", "PECS by dataset", replication=False)]
+    import pandas as pd
+
+    cells = marked(results.cells)
+    cells = cells.loc[~cells["model"].isin(analyses.models_of(group="replication"))]
+    index = ["model", "regime"]
+    rows = cells[index].drop_duplicates()
+    columns = [MODEL, REGIME]
+    for dataset in DATASETS:
+        names = {"pecs": dataset, "pecs_std": f"{dataset}_std", "mark": f"{dataset}_mark", "n_pairs": f"{dataset}_n"}
+        part = cells.loc[cells["dataset"] == dataset, [*index, *names]].rename(columns=names)
+        rows = rows.merge(part, on=index, how="left")
+        heading = _n(TITLES[dataset], part[f"{dataset}_n"])
+        columns.append(Column(dataset, heading, "fraction", spread=f"{dataset}_std", mark=f"{dataset}_mark"))
+    names = {"pecs": "mean", "pecs_std": "mean_std", "mark": "mean_mark"}
+    overall = marked(results.overall).reindex(columns=pd.Index([*index, *names])).rename(columns=names)
+    rows = rows.merge(overall, on=index, how="left")
+    columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
+    rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
+    notes = [epochs(cells), "mean: overall, over the runs that have all four datasets", *marks(cells)]
+    trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
+    return [PrintedTable("per_dataset", "PECS by dataset", rows, columns, notes, results.why("cells"), trace)]
 
 
 def replication_per_dataset(results: Results) -> list[PrintedTable]:
@@ -80,44 +99,14 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
     columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     why = "no model of the replication families"
-    return [
-        PrintedTable(
-            "replication_per_dataset", "Replication families, by dataset", rows, columns, notes, why, cell_trace
-        )
-    ]
+    title = "Replication families, by dataset"
+    return [PrintedTable("replication_per_dataset", title, rows, columns, notes, why, cell_trace)]
 
 
-def _by_dataset(results: Results, name: str, title: str, replication: bool) -> PrintedTable:
-    import pandas as pd
-
-    cells = marked(results.cells)
-    cells = cells.loc[cells["model"].isin(analyses.models_of(group="replication")) == replication]
-    index = ["model", "regime"]
-    rows = cells[index].drop_duplicates()
-    columns = [MODEL, REGIME]
-    for dataset in DATASETS:
-        names = {"pecs": dataset, "pecs_std": f"{dataset}_std", "mark": f"{dataset}_mark", "n_pairs": f"{dataset}_n"}
-        part = cells.loc[cells["dataset"] == dataset, [*index, *names]].rename(columns=names)
-        rows = rows.merge(part, on=index, how="left")
-        columns.append(
-            Column(
-                dataset, _n(TITLES[dataset], part, names), "fraction", spread=f"{dataset}_std", mark=f"{dataset}_mark"
-            )
-        )
-    names = {"pecs": "mean", "pecs_std": "mean_std", "mark": "mean_mark"}
-    overall = marked(results.overall).reindex(columns=pd.Index([*index, *names])).rename(columns=names)
-    rows = rows.merge(overall, on=index, how="left")
-    columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
-    rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
-    notes = [epochs(cells), "mean: overall, over the runs that have all four datasets", *marks(cells)]
-    trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
-    return PrintedTable(name, title, rows, columns, notes, results.why("cells"), trace)
-
-
-def _n(title: str, part: pd.DataFrame, names: Mapping[str, str]) -> str:
+def _n(title: str, counts: pd.Series) -> str:
     """Return a heading with the number of pairs, if it is the same in all rows."""
-    counts = part[names["n_pairs"]].dropna().unique()
-    return f"{title} (n = {int(counts[0])})" if len(counts) == 1 else title
+    known = counts.dropna().unique()
+    return f"{title} (n = {int(known[0])})" if len(known) == 1 else title
 
 
 def expanded(results: Results) -> list[PrintedTable]:

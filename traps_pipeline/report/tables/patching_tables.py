@@ -11,8 +11,7 @@ SITES = {"residual": "residual stream", "attention": "attention", "mlp": "MLP"}
 
 
 def patching(results: Results) -> list[PrintedTable]:
-    """Return indirect effects of activation patching between matched controls and voids, by site and group of
-    positions, beside nulls."""
+    """Return indirect effects of activation patching, by site and group of positions, beside nulls."""
     rows = results.patching
     keys = ["model", "dataset", "into", "site", "layer", "group"]
     nulls = rows.loc[rows["source"] != "pair"]

@@ -27,8 +27,7 @@ NOTES = (
 
 
 def by_features(results: Results) -> pd.DataFrame:
-    """Return one row per model, prompt, analysis, source and target of `probe_baselines`: the value of each of its
-    features, and noise_spread."""
+    """Return a row per AT of `probe_baselines`: the value of each of its features, and noise_spread."""
     import pandas as pd
 
     rows = results.baselines
@@ -44,8 +43,7 @@ def other_probes(results: Results) -> list[str]:
 
 
 def against(results: Results, analysis: str) -> pd.DataFrame:
-    """Return BESIDE of each model, source and target under an analysis: the best raw input (its name, its AUROC), the
-    output margin and noise."""
+    """Return BESIDE of each model, source and target under an analysis: best raw input, output margin and noise."""
     import pandas as pd
 
     rows = by_features(results)
@@ -57,8 +55,7 @@ def against(results: Results, analysis: str) -> pd.DataFrame:
 
 
 def best_name(values: Mapping[Any, float]) -> str:
-    """Return the feature with the highest AUROC, the first of equals; NO_RAW where none is above chance, empty where
-    there is none at all."""
+    """Return the feature with the highest AUROC; NO_RAW where none is above chance, empty where there is none."""
     known = {str(name): value for name, value in values.items() if value == value}
     best = max(known, key=lambda name: known[name], default="")
     return NO_RAW if best and known[best] <= 0.5 else best

@@ -1,5 +1,4 @@
-"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, nearest centroids; beside the best of
-the raw inputs, the output margin and the floor of noise."""
+"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, centroids; beside baselines."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ if TYPE_CHECKING:
 
 
 def probes(results: Results) -> list[PrintedTable]:
-    """Return probes from one dataset on another: best layers, confabulated voids alone, means by transfer type, and the
-    layer that is chosen without the target's labels."""
+    """Return probes between datasets: best layers, Cf->Cf, means by type, layers without the target's labels."""
     pairs = _pairs(results)
     tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
     return [*tables, _layers(results), _catch(results)]
@@ -58,7 +56,7 @@ class At(NamedTuple):
 
 _LAYER_AND_VALUE = ("layer", "value", "low", "high")
 # The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
-FIGURES = {
+PAIR_FIGURES = {
     "best": At("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
     "chosen": At("transfer", "chosen", _LAYER_AND_VALUE),
     "held_out": At("held_out", "all_sample_best"),
@@ -76,8 +74,7 @@ BASELINES = {
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per model and ordered pair: the paper's best layer, the layer chosen without labels of the target,
-    and Cf->Cf at its own and at the best layer, as FIGURES."""
+    """Return PAIR_FIGURES, a row per model and ordered pair: best and chosen layers, and Cf->Cf at both."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -86,12 +83,16 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     asked = by_pair("transfer", rows["model"].notna())
     known = rows["value"].notna()
-    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in FIGURES.items()}
+    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
-        | {f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan) for name, at in FIGURES.items() for c in at.columns}
+        | {
+            f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
+            for name, at in PAIR_FIGURES.items()
+            for c in at.columns
+        }
         | {"note": next((of[key]["note"] for of in notes if key in of), "")}
         for model in rows["model"].unique()
         for key in ((str(model), *pair) for pair in TRANSFER_PAIRS)
@@ -168,7 +169,7 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
         beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in FIGURES), *beside, "held_noise", "cf_held_noise"]
+        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *beside, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = {
             **dict.fromkeys(figures, "mean"),

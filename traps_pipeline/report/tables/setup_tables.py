@@ -8,10 +8,7 @@ from typing import Any
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import (
-    MODEL,
-    frame,
-)
+from traps_pipeline.report.tables.table_columns import MODEL, frame
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.storage.media import MediaSpec
 

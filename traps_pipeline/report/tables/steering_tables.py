@@ -41,8 +41,7 @@ SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def cosines(results: Results) -> list[PrintedTable]:
-    """Return cosines of void directions at the steered layer, with what few pairs take away from them: of datasets
-    under one prompt, and of a dataset under both."""
+    """Return cosines of void directions, of datasets under one prompt and of a dataset under both; and reliability."""
     rows = results.cosines
     order = [*SHORT]
     place, other = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
@@ -86,8 +85,7 @@ def _place(values: pd.Series) -> pd.Series:
 
 
 def steering(results: Results) -> list[PrintedTable]:
-    """Abstention under steering: over all paths, by regimes, families and domains, at the largest alpha, by alpha, by
-    layer."""
+    """Return abstention under steering: overall, by regime, family and domain, at the top alpha, by alpha, by layer."""
     return [
         _shares(results),
         _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),

@@ -7,17 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import (
-    DATASET,
-    MISSING,
-    PECS,
-    SHARES,
-    N,
-    epochs,
-    marked,
-    marks,
-    titled,
-)
+from traps_pipeline.report.tables.table_columns import DATASET, MISSING, PECS, SHARES, N, epochs, marked, marks, titled
 from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
 from traps_pipeline.scoring import analyses

@@ -69,8 +69,7 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
-    """Return rows that compare entries, `marked` and with COUNTED. sides: for each side, the columns of rows that hold
-    its model, regime and dataset; entries: cells, and those of the dataset `overall`."""
+    """Return rows that compare entries, `marked` and with COUNTED. sides: their columns of model, regime, dataset."""
     import pandas as pd
 
     by_key = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
@@ -126,9 +125,7 @@ def best_first(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Return the rows sorted by these columns; datasets and regimes in the benchmark's order, models in the
-    registry's.
-    """
+    """Return the rows sorted by these columns; datasets, regimes and models in their own order."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
     def place(values: pd.Series) -> pd.Series:

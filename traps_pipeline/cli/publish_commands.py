@@ -1,22 +1,18 @@
-"""`traps publish release`, `verify`, `harness` and `traps benchmark commit`, `prove`: what is published, and proofs."""
+"""`traps publish`: releases, their checksums and harnesses; a study as one file and in others' forms; boards."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace, print_json, whole
-from traps_pipeline.cli.submission_commands import verify_file
-
-if TYPE_CHECKING:
-    from traps_pipeline.release.commitment import Commitment
-    from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of releases."""
+    """Add the commands of what is published."""
     text = "write the folder that is published: clips, questions, labels, certificates, card, checksums"
     parser = commands.add("publish release", release, text, example="out --anonymous")
     parser.add_argument("folder", type=Path, help="an empty or new one")
@@ -50,21 +46,27 @@ def add(commands: Commands) -> None:
         help="so many evenly spaced frames of a clip, for a model whose entry says so (default: 25, at 5 a second)",
     )  # fmt: skip
 
-    text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
-    example = "private --out commitment.json --reveal reveal.json"
-    parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
-    parser.add_argument("benchmark", type=Path, help="a folder that `traps benchmark sample` wrote")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
-    parser.add_argument("--reveal", type=Path, required=True, metavar="FILE", help="the seed and a secret number")
+    text = "pack a study's items, answers, votes and numbers into one file"
+    parser = commands.add("publish submit", submit, text, example="mine.zip --name mine")
+    parser.add_argument("file", type=Path, help="the zip to write")
+    parser.add_argument("--name", required=True, help="of the submission: lower-case letters, digits, - and .")
 
-    text = "prove that a revealed benchmark is the one that was committed"
-    example = "commitment.json reveal.json --specs private"
-    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
-    parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
-    parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
-    parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
-    parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
-    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
+    text = "write the leaderboard as the hub's .eval_results, as Every Eval Ever JSON, and as Parquet"
+    parser = commands.add("publish results", results, text, example="results --dataset owner/name")
+    parser.add_argument("folder", type=Path, help="where the files are written")
+    parser.add_argument("--dataset", required=True, metavar="OWNER/NAME", help="repository of the release on the hub")
+    parser.add_argument("--organization", default="unknown", help="who made the evaluation")
+    parser.add_argument("--developer", default="unknown", help="of the models, as the hub names it")
+
+    text = "verify submissions, and make one page of them; other versions or panels are not ranked together"
+    parser = commands.add(
+        "publish leaderboard", leaderboard, text, example="mine.zip --out board", workspace=False, json=True
+    )
+    parser.add_argument(
+        "submissions", type=Path, nargs="+", help="files of `traps publish submit`, or folders of such files"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="of the page and its table")
+    parser.add_argument("--release", type=Path, metavar="FOLDER", help="hold items and clips against this release")
 
 
 def release(arguments: argparse.Namespace) -> int:
@@ -131,6 +133,24 @@ def verify(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
+    """Return what `traps publish verify` says of a submission."""
+    from traps_pipeline.release.submission import read_submission
+    from traps_pipeline.release.verification import verify
+
+    found = verify(read_submission(path), release)
+    if is_json:
+        print_json({"problems": found.problems, "checked": found.checked, "not_checked": found.unchecked})
+        return FAILED if found.problems else OK
+    for problem in found.problems:
+        print(plain(problem))
+    print(f"checked: {', '.join(found.checked)}")
+    for what in found.unchecked:
+        print(f"not checked: {what}")
+    print(f"{path}: {'does not hold' if found.problems else 'holds'}")
+    return FAILED if found.problems else OK
+
+
 def harness(arguments: argparse.Namespace) -> int:
     """See `traps publish harness --help`."""
     from traps_pipeline.release.harness.write import LMMS, shown, write_harness
@@ -143,51 +163,43 @@ def harness(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def commit_benchmark(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark commit --help`."""
-    from traps_pipeline.release.commitment import commit
+def submit(arguments: argparse.Namespace) -> int:
+    """See `traps publish submit --help`."""
+    from traps_pipeline.release.submission import pack
 
-    made = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
-    print(f"{len(made.specs)} records of {made.name} {made.version} are committed in {arguments.out}: publish it")
-    print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
+    about = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
+    size = arguments.file.stat().st_size / 1e6
+    of_what = f"benchmark {about.benchmark} {about.version}, panel {about.panel}"
+    print(f"{arguments.file}: {about.name}, {of_what}, {size:.1f} MB")
+    print(f"next: traps publish verify {arguments.file} --release FOLDER")
     return OK
 
 
-def verify_commitment(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark prove --help`."""
-    from traps_pipeline.release import commitment as sealed
+def results(arguments: argparse.Namespace) -> int:
+    """See `traps publish results --help`."""
+    from traps_pipeline.release.results import Who, write_results
 
-    published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
-    if arguments.without_drawing and not arguments.specs:
-        raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
-    problems, proven = [], []
-    specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
-    if specs is not None:
-        problems += sealed.broken_seals(published, reveal, specs)
-        proven.append(f"the records of {arguments.specs} are the committed ones")
-    if not arguments.without_drawing and not problems:
-        drawn = sealed.drawn_again(
-            published, reveal, workers=arguments.workers, report=lambda line: print(line, flush=True)
-        )
-        problems += _not_drawn(published, sealed.broken_seals(published, reveal, drawn), specs, drawn)
-        proven.append("the revealed seed draws them")
-    for problem in problems:
-        print(problem)
-    if problems:
-        raise TrapsError(f"{arguments.commitment}: is not proven; {len(problems)} things are not what was committed")
-    print(f"{len(published.specs)} records of {published.name} {published.version}: {', and '.join(proven)}")
-    if arguments.without_drawing:
-        print("not checked: whether the revealed seed draws them")
+    target, who = arguments.folder.absolute(), Who(arguments.organization, arguments.developer)
+    written = write_results(open_workspace(arguments), target, arguments.dataset, who)
+    print(f"{len(written)} files in {target}")
     return OK
 
 
-def _not_drawn(
-    published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
-) -> list[str]:
-    """Return what the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
-    from traps_pipeline.release.commitment import other_arithmetic, same_scene
+def leaderboard(arguments: argparse.Namespace) -> int:
+    """See `traps publish leaderboard --help`."""
+    from traps_pipeline.release.submissions import PAGE, gather, write_board
+    from traps_pipeline.report.leaderboard_page import leaderboard_text
 
-    if problems and specs is not None and {*specs} == {*drawn} and all(same_scene(specs[i], drawn[i]) for i in specs):
-        elsewhere = other_arithmetic(published) or "another kind of CPU"
-        problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
-    return problems
+    given = arguments.submissions
+    paths = [path for one in given for path in (sorted(one.glob("*.zip")) if one.is_dir() else [one])]
+    board = gather(paths, arguments.release, say=lambda line: print(plain(line), file=sys.stderr, flush=True))
+    write_board(board, arguments.out.absolute())
+    if arguments.json:
+        print_json({"groups": board.groups, "refused": board.refused})
+        return FAILED if board.refused else OK
+    for group in board.groups:
+        print(f"\n{group.title}\n{leaderboard_text(group.board)}")
+    for one in board.refused:
+        print(plain(f"refused: {one.name}: {one.problems[0]}"))
+    print(f"next: open {arguments.out / PAGE}")
+    return FAILED if board.refused else OK
