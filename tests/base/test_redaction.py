@@ -26,6 +26,7 @@ FORMS: dict[str, Callable[[str], str]] = {
     "json": json.dumps,
     "json in json": lambda key: json.dumps(json.dumps({"key": key})),
     "percent": lambda key: quote(key, safe="", errors="surrogateescape"),
+    "percent twice": lambda key: quote(quote(key, safe="", errors="surrogateescape"), safe=""),
     "percent, with plus": lambda key: quote_plus(key, errors="surrogateescape"),
     "html": lambda key: key.replace("&", "&amp;").replace('"', "&quot;").replace("'", "&#x27;"),
     "base64": lambda key: base64.b64encode(key.encode("utf-8", "surrogateescape")).decode(),
@@ -39,6 +40,9 @@ FORMS: dict[str, Callable[[str], str]] = {
     "wrapped": lambda key: "\n".join(f"| {line} |" for line in textwrap.wrap(key, 7, drop_whitespace=False)),
     "spaced": lambda key: " ".join(key),
     "cut": lambda key: key[:18],
+    "cut at its beginning": lambda key: key[9:],
+    "capitals": str.upper,
+    "hexadecimal": lambda key: key.encode("utf-8", "surrogateescape").hex(" "),
 }
 BROKEN = {
     "whole": KEY,
@@ -110,7 +114,7 @@ def test_the_password_of_an_address_and_a_key_with_any_name_are_secrets(monkeypa
 
 
 TRACEBACK = """
-import logging, threading
+import logging, threading, warnings
 from traps_pipeline.base.redaction import redact_tracebacks, redacted
 redact_tracebacks()
 redact_tracebacks()
@@ -127,19 +131,22 @@ except ValueError as error:
 thread = threading.Thread(target=fail)
 thread.start()
 thread.join()
+warnings.warn(f"sent {key}")
+type("Finalized", (), {"__del__": lambda self: fail()})()
 fail()
 """
 
 
-def test_logs_and_tracebacks_of_a_process_hold_no_key() -> None:
+def test_logs_tracebacks_and_warnings_of_a_process_hold_no_key() -> None:
     environment = {**os.environ, "MY_API_KEY": KEY, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", TRACEBACK]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 1
     shown = ran.stdout + ran.stderr
     assert KEY[:9] not in shown
-    assert ran.stderr.count("Traceback") == 3
-    assert ran.stderr.count("Bearer ***") == 3
+    assert ran.stderr.count("Traceback") == 4
+    assert ran.stderr.count("Bearer ***") == 4
+    assert "UserWarning: sent ***" in ran.stderr
     assert "ERROR:root:sent ***" in ran.stderr
     assert "ERROR:root:sent 1" in ran.stderr
     assert "Bearer ***" in ran.stdout

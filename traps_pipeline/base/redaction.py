@@ -1,8 +1,9 @@
 """Remove keys from text before it is printed, logged, stored or shown.
 
 Secrets are the values of environment variables that hold keys: those that a registry names (`hide`), those that a run
-has read (`remember`), and those whose names say so. They are found as they stand, escaped, percent-encoded or in
-base64, and also where white space, quotes or line breaks split them.
+has read (`remember`), and those whose names say so. They are found as they stand, in any case, escaped,
+percent-encoded, in base64 or in hexadecimal, also where white space, quotes or line breaks split them, and where either
+end is cut off.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import re
 import sys
 import threading
 import traceback
+import warnings
 from base64 import b64encode
 from collections.abc import Iterator
 from functools import lru_cache
@@ -21,12 +23,14 @@ from typing import Any
 
 MASK = "***"
 SHORTEST = 8  # characters: anything shorter could be an ordinary word
-_HEAD = 12  # characters of a secret that are looked for; what follows is compared, so that a cut secret is found too
+# A secret is looked for by pieces, one after another; what stands around a piece is compared with the secret. So each
+# part of a secret that has as many characters as two pieces is found.
+_PIECE = 6
 _NAMES = re.compile(r"(KEY|TOKEN|SECRET|PASSWORD|PASSWD)$", re.IGNORECASE)
 _PASSWORD = re.compile(r"://[^/\s:@]*:([^/\s@]+)@|\bpassword=([^\s&]+)")  # in an address of a database or a proxy
 _EXAMPLE = "PASSWORD"  # as our own sentences write addresses
 _ENCODED = re.compile(
-    r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
+    r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%(?:25)*[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
     re.IGNORECASE,
 )
 _IGNORED = bytes((*range(33), 127, *b"\"'`\\|"))
@@ -61,11 +65,12 @@ def redact(text: str) -> str:
         return text
     environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
     secrets = _secrets(environment, frozenset(_variables), frozenset(_values))
-    needles, spans = _needles(secrets), list[tuple[int, int]]()
+    pieces, spans = _pieces(secrets), list[tuple[int, int]]()
     for is_decoded in (False, True) if _ENCODED.search(text) else (False,):
         searched = _searched(text, is_decoded)
-        if any(needle[:_HEAD] in searched for needle in needles):
-            spans += _spans(text, needles, is_decoded)
+        windows = {searched[place : place + _PIECE] for place in range(len(searched) - _PIECE + 1)}
+        if windows & pieces.keys():
+            spans += _spans(text, pieces, is_decoded)
     for start, end in sorted(_merged(spans), reverse=True):
         text = f"{text[:start]}{MASK}{text[end:]}"
     lowered = text.lower()
@@ -75,7 +80,8 @@ def redact(text: str) -> str:
 
 
 def redact_tracebacks() -> None:
-    """Redact what this process logs, and the tracebacks that it prints: an exception may quote a request's headers."""
+    """Redact what this process logs, and the tracebacks and warnings that it prints: each may quote a request's
+    headers."""
     make = logging.getLogRecordFactory()
     if getattr(make, "__module__", "") == __name__:
         return
@@ -92,9 +98,12 @@ def redact_tracebacks() -> None:
             record.exc_text = redact("".join(traceback.format_exception(*record.exc_info)).rstrip())
         return record
 
+    format_warning = warnings.formatwarning
     logging.setLogRecordFactory(redacted_record)
+    warnings.formatwarning = lambda *args, **named: redact(format_warning(*args, **named))
     sys.excepthook = lambda *error: print(redact("".join(traceback.format_exception(*error))), end="", file=sys.stderr)
-    threading.excepthook = lambda error: sys.excepthook(
+    # What a thread or a finalizer raises.
+    threading.excepthook = sys.unraisablehook = lambda error: sys.excepthook(
         error.exc_type, error.exc_value or error.exc_type(), error.exc_traceback
     )
 
@@ -122,41 +131,49 @@ def _secrets(
 
 
 @lru_cache(maxsize=64)
-def _needles(secrets: frozenset[str]) -> tuple[str, ...]:
-    needles = set[str]()
+def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
+    """Return the pieces of all forms of the secrets: each with the forms that hold it, and where it begins in them."""
+    forms = set[str]()
     for secret in secrets:
         for part in {secret, *re.split(r"[^!-~]+", secret)}:
             if len(_searched(part, is_decoded=False)) >= SHORTEST:
-                needles |= {_searched(part, is_decoded=False), _searched(part, is_decoded=True), *_base64(part)}
-    return tuple(needle for needle in needles if len(needle) >= SHORTEST)
+                forms |= {_searched(part, is_decoded=False), _searched(part, is_decoded=True), *_encoded(part)}
+    pieces = dict[str, list[tuple[str, int]]]()
+    for form in forms:
+        places = range(0, len(form) - _PIECE + 1, _PIECE) if len(form) >= SHORTEST else ()
+        for piece, place in {form[place : place + _PIECE]: place for place in reversed(places)}.items():
+            pieces.setdefault(piece, []).append((form, place))
+    return pieces
 
 
-def _base64(secret: str) -> Iterator[str]:
-    """Yield what base64 makes of a secret inside longer content: it begins at one of three places of a group."""
+def _encoded(secret: str) -> Iterator[str]:
+    """Yield what base64 makes of a secret inside longer content, where it begins at one of three places of a group, and
+    what hexadecimal does."""
     content = secret.encode("utf-8", "surrogateescape")
+    yield content.hex()
     for before, skipped in ((0, 0), (1, 2), (2, 3)):
-        encoded = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6]
+        encoded = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6].lower()
         yield from (encoded, encoded.replace("+", "-").replace("/", "_"))
 
 
 def _searched(text: str, is_decoded: bool) -> str:
-    """Return the printable ASCII characters of a text without white space, quotes and backslashes."""
+    """Return the printable ASCII characters of a text in lower case, without white space, quotes and backslashes."""
     if is_decoded:
         text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
-    return text.encode("ascii", "ignore").translate(None, _IGNORED).decode()
+    return text.encode("ascii", "ignore").translate(None, _IGNORED).lower().decode()
 
 
 def _decoded(code: str) -> str:
     if code[0] == "&":
         return unescape(code)
-    digits = code.lstrip("\\%")
     if code[0] == "%":
-        return chr(int(digits, 16))
+        return chr(int(code[-2:], 16))
+    digits = code.lstrip("\\")
     return chr(min(int(digits[1:], 16), 0xFFFF)) if digits[1:] else ""  # without digits it is a control character
 
 
-def _spans(text: str, needles: tuple[str, ...], is_decoded: bool) -> Iterator[tuple[int, int]]:
-    """Yield the start and end of each secret in a text."""
+def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool) -> Iterator[tuple[int, int]]:
+    """Yield the start and end of each secret, or part of one, in a text."""
     characters = list[str]()
     places = list[tuple[int, int]]()
     codes = {match.start(): match for match in _ENCODED.finditer(text)} if is_decoded else {}
@@ -169,14 +186,21 @@ def _spans(text: str, needles: tuple[str, ...], is_decoded: bool) -> Iterator[tu
             places.append((place, end))
         place = end
     searched = "".join(characters)
-    for needle in needles:
-        start = searched.find(needle[:_HEAD])
+    for piece, (form, place) in ((piece, each) for piece, found in pieces.items() for each in found):
+        start = searched.find(piece)
         while start >= 0:
-            length = min(_HEAD, len(needle))
-            while needle.startswith(searched[start : start + length + 1]) and start + length < len(searched):
-                length += 1
-            yield places[start][0], places[start + length - 1][1]
-            start = searched.find(needle[:_HEAD], start + length)
+            before, behind = searched[max(0, start - place) : start], searched[start : start + len(form) - place]
+            first, last = start - _alike(before[::-1], form[:place][::-1]), start + _alike(behind, form[place:])
+            is_part = last - first >= min(2 * _PIECE, len(form))
+            if is_part:
+                yield places[first][0], places[last - 1][1]
+            start = searched.find(piece, last if is_part else start + 1)
+
+
+def _alike(text: str, other: str) -> int:
+    """Return how many characters two texts have in common at their beginnings."""
+    differing = (k for k, (one, two) in enumerate(zip(text, other, strict=False)) if one != two)
+    return next(differing, min(len(text), len(other)))
 
 
 def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
