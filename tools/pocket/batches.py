@@ -43,7 +43,8 @@ class Scenes:
         self.records: list[SceneRecord] = []
         self._frames: list[np.ndarray] = []
         self._place: list[tuple[int, int]] = []
-        self._spec, self._decoys, self.shares = recipe.media, recipe.decoys, recipe.abstain_shares or {}
+        self._spec, self._decoys = recipe.media, recipe.decoys
+        self._void_shares, self._control_shares = recipe.abstain_shares or {}, recipe.control_shares
         self._names: dict[tuple[int, int], np.ndarray] = {}  # of what was looked at: a tenth of a step otherwise
         for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
             self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
@@ -95,6 +96,12 @@ class Scenes:
         last = (self._open_frames(scene, side) - 1) // 2
         others = [pair for pair in range(every) if pair != last]
         return tuple(sorted([last, *(int(pair) for pair in rng.permutation(others)[: count - 1])]))
+
+    def label(self, look: Look, question: Question, prompt_name: str) -> str | None:
+        """Return the answer to train under a prompt, None for an abstention."""
+        record = self.records[look.scene]
+        answered = question in (record.asked, record.answerable)
+        return question.label((self._control_shares if answered else self._void_shares).get(prompt_name, 0.0))
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
         """Return a random clip with its question, another one (answerable or ill-posed), and two for the place of its
@@ -195,8 +202,11 @@ class Batches:
         before, _, rest = rest.partition(token)
         between, after = rest.split(_QUESTION)
         end = processor.tokenizer.eos_token
-        share = self._scenes.shares.get(prompt_name, 0.0)
-        questions = [(q.question + after, say(q.label(share), prompt_name) + end) for q in look.questions]
+        labels = [self._scenes.label(look, question, prompt_name) for question in look.questions]
+        questions = [
+            (question.question + after, say(label, prompt_name) + end)
+            for question, label in zip(look.questions, labels, strict=True)
+        ]
         return head, [user + before, *pairs, between], questions
 
     def _ids(self, text: str) -> list[int]:

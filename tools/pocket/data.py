@@ -43,8 +43,8 @@ STREAM: dict[Split, int] = {"train": 101, "held-out": 102}  # first word of a st
 class Question:
     """A question and the answer that the model is trained to give: a label, a guess, or None for an abstention.
 
-    draw: of a question about a void whose label depends on the prompt, a number in [0, 1); under a prompt with a larger
-    share of abstentions the label is an abstention, and else `answer`, a guess.
+    draw: of a question whose label depends on the prompt, a number in [0, 1); under a prompt with a larger share of
+    abstentions the label is an abstention, and else `answer`: of a void a guess.
     """
 
     question: str
@@ -170,7 +170,7 @@ def released_digests() -> frozenset[str]:
 
 def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -> SceneRecord:
     """Return the scene's questions with their labels: a void's label is an abstention with probability `abstain_share`,
-    else a guess; with shares by prompt, the number that decides this is kept."""
+    else a guess, a control's is the truth; with shares by prompt, the number that decides this is kept."""
 
     def void(question: str, labels: Sequence[str]) -> Question:
         draw, guessed = rng.random(), guess(question, labels, rng)
@@ -178,6 +178,9 @@ def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -
             return Question(question, guessed, draw)
         assert recipe.abstain_share is not None, "a recipe has one of the two"
         return Question(question, None if draw < recipe.abstain_share else guessed)
+
+    def known(question: str, answer: str) -> Question:
+        return Question(question, answer, None if recipe.abstain_shares is None else rng.random())
 
     wording, both = shot.wording, shot.wording.answerable_question
     family, params, closing = shot.control.family, shot.control.params, shot.control.closing
@@ -189,10 +192,10 @@ def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -
         aliases=dict(wording.aliases),
         answer_type=family.answer_type,
         cut_frame=shot.cut_frame,
-        asked=Question(wording.question, shot.outcome.answer),
+        asked=known(wording.question, shot.outcome.answer),
         visual=void(wording.question, wording.labels),
         ill_posed=void(shot.ill_posed_question, ()),
-        answerable=Question(both.question, both.answer),
+        answerable=known(both.question, both.answer),
         ball=params.ball_colours[0] if hasattr(params, "ball_colours") else params.ball_colour,
         places=shot.places,
         n_frames=len(shot.control.qpos),
@@ -283,9 +286,11 @@ def render(
 
 def _check_recipe(recipe: Recipe, folder: Path) -> None:
     """Raise TrapsError when the folder holds scenes of another recipe."""
-    # The numbers of scenes may change: a shard's first scenes do not depend on how many there are.
-    decisive = ("data_seed", "media", "abstain_share", "abstain_shares", "jitter", "decoys")
-    expected = digest(recipe.content(*decisive))
+    # The numbers of scenes may change: a shard's first scenes do not depend on how many there are. So may the shares by
+    # prompt: a scene keeps the numbers that are compared with them.
+    by_prompt = recipe.abstain_shares is not None
+    content = recipe.content("data_seed", "media", "abstain_share", "jitter", "decoys")
+    expected = digest(content | {"by_prompt": by_prompt})
     note = folder / "recipe.sha256"
     if not note.is_file():
         write_text(note, expected + "\n")

@@ -57,7 +57,7 @@ class Recipe(BaseModel):
     jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
     which a panel stands where it hides nothing; without it, the panel tells the side. abstain_shares: by prompt (one of
     `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with a larger
-    share.
+    share. control_shares: the same for questions that the clip answers; 0 for a prompt that is not named.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -67,6 +67,7 @@ class Recipe(BaseModel):
     media: MediaSpec
     abstain_share: float | None = Field(default=None, ge=0, le=1)
     abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None
+    control_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(default_factory=dict)
     jitter: Jitter | None = None
     decoys: float = Field(default=0, ge=0, le=1)
     training: Training
@@ -74,7 +75,7 @@ class Recipe(BaseModel):
     def content(self, *only: str) -> dict[str, Any]:
         """Return the settings (only: these) for a digest. One that came later counts only where it is used, so that
         what was made before it keeps its digest."""
-        unused = {"abstain_share", "abstain_shares", "jitter", "decoys"} - self.model_fields_set
+        unused = {"abstain_share", "abstain_shares", "control_shares", "jitter", "decoys"} - self.model_fields_set
         dumped = self.model_dump(mode="json", include={*only} or None, exclude=unused)
         if "training" in dumped and not self.training.pairs:
             del dumped["training"]["pairs"]
@@ -95,10 +96,19 @@ class Recipe(BaseModel):
             raise ValueError(f"abstain_shares names {sorted(value)}; it needs a share for each of {', '.join(PROMPTS)}")
         return value
 
+    @field_validator("control_shares")
+    @classmethod
+    def _known_prompts(cls, value: dict[str, float]) -> dict[str, float]:
+        if unknown := sorted(set(value) - set(PROMPTS)):
+            raise ValueError(f"control_shares names {unknown}; known: {', '.join(PROMPTS)}")
+        return value
+
     @model_validator(mode="after")
     def _one_kind_of_share(self) -> Recipe:
         if (self.abstain_share is None) == (self.abstain_shares is None):
             raise ValueError("give abstain_share (one for all prompts) or abstain_shares (by prompt), and not both")
+        if self.control_shares and self.abstain_shares is None:
+            raise ValueError("control_shares needs abstain_shares: give voids a share by prompt, too")
         return self
 
     def count(self, family: str, split: Split) -> int:
