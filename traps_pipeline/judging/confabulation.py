@@ -29,8 +29,9 @@ from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import NETWORK, get_model, structured
+from traps_pipeline.models.registry import NETWORK, get_model
 from traps_pipeline.models.request import Request
+from traps_pipeline.models.schemas import structured
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.ratings import AXES

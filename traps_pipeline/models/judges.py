@@ -25,9 +25,9 @@ from traps_pipeline.models.registry import (
     Protocol,
     is_reference,
     read_entries,
-    structured,
     with_own,
 )
+from traps_pipeline.models.schemas import structured
 from traps_pipeline.models.thinking import Marks
 
 JUDGES_FILE = ASSETS / "judges.yaml"

@@ -22,6 +22,7 @@ from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
+from traps_pipeline.models.schemas import answer_object
 from traps_pipeline.models.thinking import Marks, marks_of
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import fields_of
@@ -46,21 +47,6 @@ OTHER_WAIVERS = ("media", "reasoning", "json_schema", "identifier", "retries")
 NETWORK = "api"  # the backend that asks over the network
 LOCAL = "local"  # the backend that asks a checkpoint on this machine
 LOCAL_TIMEOUT_S = 24 * 3600.0
-
-
-def structured(name: str, **properties: Any) -> dict[str, Any]:
-    """Return the `response_format` of an object with exactly these properties (JSON schema of each), all of them
-    required."""
-    schema = {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
-    return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": schema}}
-
-
-_TYPES = {"reason": "string", "abstain": "boolean", "final_answer": "string"}
-
-
-def answer_object(fields: Iterable[str]) -> dict[str, Any]:
-    """Return the `response_format` of an answer with these fields (`regimes.FIELDS`)."""
-    return structured("answer", **{name: {"type": _TYPES[name]} for name in fields})
 
 
 class Limits(BaseModel):
