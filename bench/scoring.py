@@ -108,7 +108,7 @@ def ballot(asked: pd.DataFrame, judge: str, yes: np.ndarray, rng: np.random.Gene
     columns = asked.drop(columns=["pair_id", "scenario_id", "outcome"])
     valid = rng.random(len(asked)) > 0.01
     verdict = {"valid": valid, "invalid_reason": None, "abstained": abstained, "correct": correct}
-    return columns.assign(judge=judge, panel="three@1", **verdict)
+    return columns.assign(judge=judge, panel="three@1", rejects_premise=None, **verdict)
 
 
 def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, found: Any) -> float:

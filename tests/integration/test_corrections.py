@@ -129,7 +129,8 @@ def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study
 
 
 def test_a_deleted_table_fails_its_check_within_a_tick_of_the_sensor(study: Checkout) -> None:
-    assert study.python("-c", TICK).out.split() == ["0"]
+    first = study.python("-c", TICK)
+    assert first.out.split() == ["0"], first.err
     tables = Workspace.open(study.workspace).tables
     cell = {"dataset": "chaotic", "model": "prior", "regime": "json", "run": 1}
     tables.path(VERDICTS, cell).unlink()

@@ -45,7 +45,7 @@ COMMANDS = (
     "plan {experiment}",
     "run {experiment} --until responses",
     "run {experiment} --until votes --no-preflight",
-    "judges check own",
+    "models check own",
     "requests export {experiment} --batch --out {out}",
     "votes export {experiment} --out {out}",
     "doctor",

@@ -64,6 +64,7 @@ def decide(workspace: Workspace, at: Cell, failures: set[int], numbers: range) -
             "unanimous": True,
             "undecided": abstained is None,
             "is_json": None,
+            "rejects_premise": None,
         }
         rows.append(VerdictRow(**row))
     workspace.tables.write(VERDICTS, at.partition, rows, {})

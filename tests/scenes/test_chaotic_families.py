@@ -289,8 +289,10 @@ def test_the_futures_of_the_state_at_a_cut_disagree_and_are_the_same_each_time(s
 @pytest.mark.slow  # draws a scenario up to its certificates
 def test_a_draw_whose_recorded_outcome_is_a_rare_future_of_its_cut_is_rejected() -> None:
     looks = ("bystanders", "floor", "light", "material", "panel")
-    rare = try_draw(Draw("seesaw_sorter", 1, 100, frozenset(), looks))  # 45 of 47 futures end in the left bin
-    assert rare == "95.7% of the futures of the state at the cut agree, at most 75% may"
+    # Its starts disagree up to some cut, but of the state at that cut 45 of 47 futures end in the left bin.
+    assert try_draw(Draw("seesaw_sorter", 1, 100, frozenset(), looks)) == (
+        "no cut at 1.0 s or later leaves the outcome open"
+    )
 
 
 @pytest.mark.parametrize("name", CHAOTIC)

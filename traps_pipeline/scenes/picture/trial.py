@@ -39,7 +39,10 @@ def draw_frame() -> str:
 
 def opengl_variables() -> dict[str, str]:
     """Return the environment's variables that choose what draws, and how: of MuJoCo, PyOpenGL, Mesa and the loader."""
-    return {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
+    chosen = {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
+    # OpenCV adds a folder of its own to the loader's when it is imported: nobody chose that.
+    folders = [folder for folder in chosen.pop("LD_LIBRARY_PATH", "").split(":") if folder and "/cv2/" not in folder]
+    return chosen | ({"LD_LIBRARY_PATH": ":".join(folders)} if folders else {})
 
 
 def _unusable(reason: str) -> str:
