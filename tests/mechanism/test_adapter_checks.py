@@ -67,20 +67,11 @@ def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
         ("qwen3-vl", "alpha 0", a_hook_that_stays, "steering with alpha 0 leaves a hook"),
         ("qwen3-vl", "alpha", a_hook_that_stays, "a steered state at layer 2 is not the plain one and alpha times v"),
         ("qwen3-vl", "clips", rounded_features, "a remembered clip gives other states"),
-        (
-            "gemma-4",
-            "patching",
-            paths_beside_the_stream_forgotten,
-            "patching all positions misses the source's",
-        ),
+        ("gemma-4", "patching", paths_beside_the_stream_forgotten, "patching all positions misses the source's"),
     ],
 )
 def test_a_check_loses_where_the_adapter_is_broken(
-    family: Family,
-    check: str,
-    broken: Callable[[pytest.MonkeyPatch], None],
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
+    family: Family, check: str, broken: Callable[[pytest.MonkeyPatch], None], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     subject = Subject(model(family), *brightening())
     subject.model.clips = clips.ClipMemory()

@@ -21,7 +21,6 @@ from traps_pipeline.mechanism.directions import (
     save_directions,
     seeded_order,
     steered_scenarios,
-    vector_digest,
 )
 
 NAMES = [f"plinko-{n:04d}" for n in range(200)]
@@ -114,12 +113,6 @@ def test_directions_come_back_as_they_were_saved_and_damage_is_told(tmp_path: Pa
     path.write_bytes(content)
     with raises(TrapsError, "mechanism.directions.load_directions"):
         load_directions(path)
-
-
-def test_a_direction_is_known_by_its_numbers() -> None:
-    vector = np.arange(4, dtype=np.float32)
-    assert vector_digest(vector) == vector_digest(vector.astype(np.float64))
-    assert vector_digest(vector) != vector_digest(np.nextafter(vector, np.float32(9)))
 
 
 def test_cosines_are_of_angles() -> None:

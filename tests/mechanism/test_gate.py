@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -76,19 +78,10 @@ def study(pairs: int = 12, families: int = 3) -> tuple[Items, np.ndarray]:
     """Items of all datasets. Column 0 is the side everywhere; column 1 names the scenario so loudly that a gate which
     has seen it would know it."""
     rows, rng = [], np.random.default_rng(0)
-    for dataset in DATASETS:
-        for number in range(pairs):
-            for void in (False, True):
-                name = f"{taxonomy_of(dataset)}-{number:02d}"
-                rows.append(
-                    (
-                        dataset,
-                        name,
-                        f"{taxonomy_of(dataset)}:{number % families}",
-                        f"{name}{dataset if void else ''}",
-                        void,
-                    )
-                )
+    for dataset, number, void in product(DATASETS, range(pairs), (False, True)):
+        taxonomy = taxonomy_of(dataset)
+        name, family = f"{taxonomy}-{number:02d}", f"{taxonomy}:{number % families}"
+        rows.append((dataset, name, family, f"{name}{dataset if void else ''}", void))
     table = pd.DataFrame(rows, columns=["dataset", "scenario_id", "family", "prompt", "void"])
     features = rng.normal(size=(len(table), 10))
     features[:, 0] += 4 * table["void"]

@@ -41,8 +41,7 @@ POCKET = "pocket"
 NEW_TOKENS = 8
 PROMISED = "qwen3-vl"  # in `make test`; the others in the campaign
 each = pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.promise] * (name == PROMISED)) for name in (*FAMILIES, POCKET)],
+    "name", [pytest.param(name, marks=[pytest.mark.promise] * (name == PROMISED)) for name in (*FAMILIES, POCKET)]
 )
 
 

@@ -147,10 +147,7 @@ def test_directions_are_what_the_states_say(study: Workspace) -> None:
     assert len(table) == 4 * (1 + 2) * 5  # the void direction and two draws of a null, at five layers
     row = table.query("dataset == 'occlusion' and kind == 'void' and layer == 2").iloc[0]
     said = json.loads(study.resolve(row["path"]).with_suffix(".json").read_text())
-    states, items = (
-        StoredStates.of(study, STANDARD),
-        StoredStates.of(study, STANDARD).dataset("occlusion"),
-    )
+    states, items = (StoredStates.of(study, STANDARD), StoredStates.of(study, STANDARD).dataset("occlusion"))
     chosen, at = items["scenario_id"].isin(said["scenarios"]).to_numpy(), states.read("occlusion", 2).astype(float)
     void = (items["side"] == "void").to_numpy()
     difference = at[chosen & void].mean(axis=0) - at[chosen & ~void].mean(axis=0)

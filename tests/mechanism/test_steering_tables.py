@@ -6,10 +6,9 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.tables import probe_tables, steering_tables
+from traps_pipeline.report.tables import probe_tables
 from traps_pipeline.scoring.published import published_rows
 
 PAPER = PublishedResults()
@@ -87,14 +86,3 @@ def test_published_rows_without_a_figure_are_left_out_and_not_invented() -> None
     layers = next(t for t in probe_tables.probes(PAPER) if t.name == "probe_layers")
     assert layers.absence == "not run: the paper prints no curves"
     assert set(PAPER.effects["directions"]) == {"standard"} and set(PAPER.effects["regime"]) == {"guided"}
-
-
-def test_a_study_that_steers_no_guided_directions_says_so_where_families_would_stand() -> None:
-    class Made(type(PAPER)):
-        is_study = True
-
-    made = Made()
-    rows = made_up(BASE).reindex(columns=pd.Index(STEERING_EFFECTS.names))
-    made.made["effects"] = rows.assign(directions="standard")
-    (table,) = (t for t in steering_tables.steering(made) if t.name == "steering_families")
-    assert table.absence == "not run: no directions of the guided prompt were steered under guided inference"

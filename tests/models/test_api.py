@@ -117,10 +117,7 @@ def test_what_may_pass_is_worth_another_try(provider: Provider, route: str, faul
 
 @pytest.mark.promise
 @pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize(
-    ("fault", "error"),
-    [("bad_request", "http_400"), ("unauthorized", "http_401")],
-)
+@pytest.mark.parametrize(("fault", "error"), [("bad_request", "http_400"), ("unauthorized", "http_401")])
 def test_what_will_not_pass_is_final_and_told_once_without_the_key(
     provider: Provider, route: str, fault: str, error: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,13 +18,7 @@ from tests.build.ledger import budget_in, local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import Money, Releasable
 from traps_pipeline.models.ask import Call, Work, run_work
-from traps_pipeline.models.budget import (
-    Budget,
-    BudgetReached,
-    check_money,
-    most_tokens,
-    worst_case_usd,
-)
+from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError

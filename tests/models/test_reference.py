@@ -11,7 +11,7 @@ import pytest
 
 from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, uniform
 from traps_pipeline.models.registry import get_model
-from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.models.request import Request, TransientError
 from traps_pipeline.protocol.regimes import FIELDS
 
 LABELS = ["left", "right", "elsewhere"]
@@ -23,14 +23,6 @@ def request(side: str, item: int = 0, regime: str = "standard", **params: Any) -
         secret["ground_truth"] = "right"
     about = {"item_id": f"{side}-{item}", "model": "m", "regime": regime, "run": 1}
     return Request("m", "reference", params, "system", "question", about, secret=secret)
-
-
-def abstains(outcome: Outcome) -> bool:
-    return ABSTENTION in str(outcome.text)
-
-
-def answers(strategy: str, side: str, **params: Any) -> str | None:
-    return STRATEGIES[strategy](request(side, strategy=strategy, **params))
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,7 @@ def test_a_rule_abstains_by_its_own_cue_and_by_no_other(
     assert {rule for rule in RULES if abstains(rule, media, question)} == abstaining
 
 
+@pytest.mark.slow  # fifteen renderers
 @pytest.mark.parametrize("panel", PANELS)
 def test_the_panel_rule_sees_panels_of_every_colour_and_material_and_no_panel_where_there_is_none(panel: str) -> None:
     case = load("bounce-0001")

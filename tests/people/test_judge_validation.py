@@ -18,12 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.people.judge_validation import (
-    HumanLabels,
-    compare,
-    is_degenerate,
-    read_labels,
-)
+from traps_pipeline.people.judge_validation import HumanLabels, compare, is_degenerate, read_labels
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.benchmark_tables import ITEMS

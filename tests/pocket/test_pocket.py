@@ -13,14 +13,7 @@ import pytest
 
 from tools.pocket.__main__ import build_parser
 from tools.pocket.commands import CARD, FACTS, WEIGHTS
-from tools.pocket.data import (
-    STREAM,
-    SceneRecord,
-    ShardJob,
-    draw_shard,
-    released_digests,
-    shard_jobs,
-)
+from tools.pocket.data import STREAM, SceneRecord, ShardJob, draw_shard, released_digests, shard_jobs
 from tools.pocket.evaluate import markdown, read_cells
 from tools.pocket.recipe import POCKET, Recipe, load_recipe
 from tools.pocket.words import PROMPTS, say

@@ -100,7 +100,6 @@ def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Pat
     assert problems(tmp_path / "f.zip") == ["votes.parquet: is not the table that was packed"]
 
 
-@pytest.mark.promise
 def test_an_edited_answer_is_named(packed: Path, tmp_path: Path) -> None:
     def edit(frames: Frames) -> None:
         put(frames, "responses", "text", "The answer is: left.", item_id=ITEM, model="prior", regime="standard")
