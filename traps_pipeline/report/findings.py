@@ -13,7 +13,7 @@ from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.expression_figures import orders, scored_items
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.control_reports import beside
-from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
+from traps_pipeline.report.tables.inside_columns import SHORTCUTS
 
 if TYPE_CHECKING:
     import pandas as pd
