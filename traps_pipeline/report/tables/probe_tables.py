@@ -69,12 +69,7 @@ PAIR_FIGURES = {
     "cf_held_out": At("confabulated_held_out", "all_sample_best"),
 }
 # The analyses whose baselines stand beside a pair's figures, by the prefix of their columns.
-BASELINES = {
-    "": "transfer",
-    "cf_": "confabulated",
-    "held_": "held_out",
-    "cf_held_": "confabulated_held_out",
-}
+BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_held_": "confabulated_held_out"}
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
@@ -116,8 +111,8 @@ def _pairs(results: Results) -> pd.DataFrame:
 
 
 def _marked(rows: pd.DataFrame) -> pd.DataFrame:
-    marks = {"mark": few(rows, "best_n_voids", "best_n_controls"), "cf_mark": few(rows, "cf_n_voids", "cf_n_controls")}
-    return rows.assign(**marks)
+    cf = few(rows, "cf_n_voids", "cf_n_controls")
+    return rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"), cf_mark=cf)
 
 
 def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
@@ -175,11 +170,9 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
         figures = [*(f"{name}_value" for name in PAIR_FIGURES), *beside, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
-        by = {
-            **dict.fromkeys(figures, "mean"),
-            **dict.fromkeys(("raw", "cf_raw"), _listed),
-            **dict.fromkeys(sides, "min"),
-        }
+        by = (
+            dict[str, Any].fromkeys(figures, "mean") | {"raw": _listed, "cf_raw": _listed} | dict.fromkeys(sides, "min")
+        )
         groups = rows.groupby(["model", "transfer_type"], sort=False)
         rows = _marked(groups.agg(by).assign(n_paths=groups.size()).reset_index())
     columns = [
