@@ -13,7 +13,7 @@ from traps_pipeline.base.terminal import visible
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.report.explorer.site import WEB
 from traps_pipeline.report.writing import environment
-from traps_pipeline.servers.server import templates
+from traps_pipeline.servers.server import WEB as PAGES
 
 # Overrides, isolates and marks of direction; ESC, BEL, a C1 control, a lone carriage return; what belongs to a text.
 HOSTILE = "a\u202eb \u2066c\u2069 \u2067\u2068 \u200e\u200f\u061c \x1b[31md\x07\x9b\x85 e\rf\tg\r\nh\n"
@@ -24,9 +24,9 @@ VISIBLE = (
 EMOJI = "❤️ 1️⃣ 👩🏽‍🔬 👩‍🔬"
 
 
-@pytest.mark.parametrize("jinja", [environment, templates], ids=["reports", "pages"])
+@pytest.mark.parametrize("jinja", [environment(), environment(PAGES)], ids=["reports", "pages"])
 def test_a_template_prints_no_hidden_character(jinja) -> None:
-    template: jinja2.Template = jinja().from_string("<p title='{{ text }}'>{{ text }}</p>{{ text | tojson }}{{ 1 }}")
+    template: jinja2.Template = jinja.from_string("<p title='{{ text }}'>{{ text }}</p>{{ text | tojson }}{{ 1 }}")
     page = template.render(text=f"<b>{HOSTILE}")
     shown = f"&lt;b&gt;{VISIBLE}"
     assert page.startswith(f"<p title='{shown}'>{shown}</p>\"\\u003cb\\u003ea\\u202eb ") and page.endswith("1")

@@ -16,6 +16,7 @@ from traps_pipeline.protocol.datasets import ALL_CATEGORIES, BESIDE, CROSSED, SI
 from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
+from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
@@ -82,7 +83,7 @@ def _of_arm(
     for category in categories_of_dataset(arm):
         if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
             table = workspace.tables.read(ARMS_TABLE, {"category": category})
-            rows += table.astype(object).where(table.notna(), None).to_dict("records")
+            rows += records(table)
     rows = [row for row in rows if row["arm"] == arm and row["refused"] is None]
     if not rows:
         raise TrapsError(f"items {arm}: no scenario of this study admits it; take more scenarios or leave the arm out")

@@ -26,6 +26,7 @@ from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
@@ -127,12 +128,12 @@ def raw_features(
 
     features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
-        records = rows.astype(object).where(rows.notna(), None).to_dict("records")
+        shown = records(rows)
         features["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
-        features["first frame"][dataset] = np.stack([seen[row["clip"]][0][0].ravel() for row in records])
-        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in records])
-        features["length"][dataset] = np.array([[seen[row["clip"]][2]] for row in records])
-        features["time stamps"][dataset] = np.array([stamps(row) for row in records])
+        features["first frame"][dataset] = np.stack([seen[row["clip"]][0][0].ravel() for row in shown])
+        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown])
+        features["length"][dataset] = np.array([[seen[row["clip"]][2]] for row in shown])
+        features["time stamps"][dataset] = np.array([stamps(row) for row in shown])
     return dict(features)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, create_model
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
@@ -36,46 +36,21 @@ DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
     "abstention": ("abstained",),
     "correctness": ("correct",),
 }
+_STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
 class ClipLabel(BaseModel):
     """What a person says about a clip and its question; answer is null where it cannot be known."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = _STRICT
     answer: str | None = Field(min_length=1, max_length=MOST_CHARACTERS)
 
 
-class AbstentionLabel(BaseModel):
-    """Whether an answer abstains."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    abstained: StrictBool
-
-
-class CorrectnessLabel(BaseModel):
-    """Whether an answer says what the ground truth says."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    correct: StrictBool
-
-
-class AxesLabel(BaseModel):
-    """Which axes of confabulation hold."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    hallucinated_premise: StrictBool
-    invalid_inference: StrictBool
-    epistemic_surrender: StrictBool
-    doubt_in_reasoning: StrictBool
-
-
-Label = ClipLabel | AbstentionLabel | CorrectnessLabel | AxesLabel
-LABELS: Mapping[TaskName, type[Label]] = {
-    "answerability": ClipLabel,
-    "confabulation": AxesLabel,
-    "abstention": AbstentionLabel,
-    "correctness": CorrectnessLabel,
-}
+# Of the other tasks, a person states the decisions alone.
+LABELS: Mapping[TaskName, type[BaseModel]] = {
+    task: create_model(task, __config__=_STRICT, **dict[str, Any].fromkeys(DECISIONS[task], (StrictBool, ...)))
+    for task in TASKS
+} | {"answerability": ClipLabel}
 
 
 class Line(BaseModel):

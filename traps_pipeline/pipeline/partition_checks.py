@@ -113,11 +113,7 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
 
 def _evaluation(stage: str, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
     return dg.AssetCheckEvaluation(
-        asset_key=asset_key(stage),
-        check_name=check,
-        passed=not wrong,
-        partition=key,
-        metadata=visible_metadata(wrong),
+        asset_key=asset_key(stage), check_name=check, passed=not wrong, partition=key, metadata=visible_metadata(wrong)
     )
 
 

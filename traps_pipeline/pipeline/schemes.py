@@ -32,9 +32,7 @@ EVALUATION = Partitioning(
     lambda wanted: [e.key for e in wanted.evaluations],
 )
 CELL = Partitioning(
-    {**DATASET.dimensions, **EVALUATION.dimensions},
-    lambda key: Cell.parse(key).partition,
-    lambda wanted: wanted.cells,
+    {**DATASET.dimensions, **EVALUATION.dimensions}, lambda key: Cell.parse(key).partition, lambda wanted: wanted.cells
 )
 # Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
 PROBED = Partitioning({"dataset": _HERE.probed}, lambda key: {"dataset": key}, lambda wanted: wanted.probed)

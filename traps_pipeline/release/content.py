@@ -32,6 +32,7 @@ from traps_pipeline.scenes.certification.certificates import certificates_for, p
 from traps_pipeline.scenes.certification.evidence import Claim
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
+from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = "clips"
@@ -79,11 +80,7 @@ def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
 
 def _records(workspace: Workspace, table: Any, datasets: Sequence[str] | None = None) -> list[dict[str, Any]]:
     frame = workspace.tables.read_all(table, **({} if datasets is None else {"dataset": tuple(datasets)}))
-    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    rows = [{str(name): value for name, value in row.items()} for row in rows]
-    for row in rows:
-        row["labels"] = list(row["labels"])
-    return sorted(rows, key=lambda row: [row[name] for name in table.key])
+    return sorted(records(frame), key=lambda row: [row[name] for name in table.key])
 
 
 def _ids(items: Iterable[Mapping[str, Any]]) -> set[str]:
@@ -208,13 +205,6 @@ def prompt_rows(canary: str) -> list[PromptRow]:
     texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
     texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}
     return [
-        PromptRow(
-            name=name,
-            role=role,
-            text=text,
-            version=digest(text)[:16],
-            licence=PROMPT_LICENCE,
-            canary=canary,
-        )
+        PromptRow(name=name, role=role, text=text, version=digest(text)[:16], licence=PROMPT_LICENCE, canary=canary)
         for (role, name), text in sorted(texts.items())
     ]

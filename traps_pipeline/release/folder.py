@@ -34,16 +34,9 @@ from traps_pipeline.release.released_rows import (
 from traps_pipeline.storage.tables import Table
 
 FORMAT = 1  # of a released folder
-MANIFEST, CARD, DICTIONARY, CROISSANT, CITATION = (
-    "release.json",
-    "README.md",
-    "DICTIONARY.md",
-    "croissant.json",
-    "CITATION.cff",
-)
-COMMITMENT = "commitment.json"
-LICENCE = "LICENSE-DATA"
-PROMPTS_LICENCE = "LICENSE-PROMPTS"
+MANIFEST, COMMITMENT, CROISSANT = "release.json", "commitment.json", "croissant.json"
+CARD, DICTIONARY, CITATION = "README.md", "DICTIONARY.md", "CITATION.cff"
+LICENCE, PROMPTS_LICENCE = "LICENSE-DATA", "LICENSE-PROMPTS"
 # The hub's loader finds clips below the folder of their table alone: pairs name theirs from the top, items from clips/.
 PLACES: Mapping[str, str] = {
     PAIRS.name: "metadata.jsonl",

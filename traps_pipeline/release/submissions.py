@@ -39,21 +39,6 @@ class Accepted:
         return self.submission.about.name
 
     @property
-    def version(self) -> str:
-        """Of the code that made it."""
-        return self.submission.about.versions.get("traps", "unknown")
-
-    @property
-    def checked(self) -> list[str]:
-        """What was checked."""
-        return self.verified.checked
-
-    @property
-    def unchecked(self) -> list[str]:
-        """What could not be."""
-        return self.verified.unchecked
-
-    @property
     def group(self) -> tuple[str, str]:
         """The digest of its items, and its panel: with which submissions it may be ranked."""
         items = self.submission.table(ITEMS)

@@ -36,7 +36,7 @@ from traps_pipeline.release.submission import Submission
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.scoring.scored import Scored, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.tables import Table, records
 
 SHOWN = 10  # sentences of one kind; the others are counted
 CLOSE = 1e-9  # figures of another machine's linear algebra may differ in their last digits
@@ -67,8 +67,8 @@ class Verified:
 def verify(submission: Submission, release: Path | None = None) -> Verified:
     """Verify a submission, against a released folder if given. Raises TrapsError for a release that cannot be read."""
     verified = Verified()
-    items = {row["item_id"]: row for row in _records(submission.table(ITEMS))}
-    answers, votes = _records(submission.table(RESPONSES)), _records(submission.table(VOTES))
+    items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
+    answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
     verified.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
     verified.look("items", _wrong_items(items.values()))
     verified.look("prompts", _wrong_prompts(submission))
@@ -86,11 +86,6 @@ def verify(submission: Submission, release: Path | None = None) -> Verified:
     if not by_rules:
         verified.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
     return verified
-
-
-def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    return [{str(name): value for name, value in row.items()} for row in rows]
 
 
 # --- items and prompts ------------------------------------------------------------------------------------------------
@@ -289,7 +284,7 @@ def _numbers(verified: Verified, submission: Submission) -> None:
 
 def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
-    theirs, ours = ({tuple(row[k] for k in key): row for row in _records(frame)} for frame in (stated, own))
+    theirs, ours = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in (stated, own))
     for entry in sorted({*theirs, *ours}, key=str):
         name = f"{table.name} {' '.join(map(str, entry))}"
         if entry not in ours or entry not in theirs:

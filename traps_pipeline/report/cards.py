@@ -12,6 +12,7 @@ from urllib.parse import urlencode
 
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.report.catalogue import FigureReport, TableReport
+from traps_pipeline.report.pair_pictures import Picture
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
@@ -137,14 +138,14 @@ def figure_card(report: FigureReport, sources: Sources) -> Card:
     )
 
 
-def picture_card(name: str, title: str, make: Callable[[], Mapping[str, Figure]], kind: str) -> Card:
-    """Return the card of pictures made from clips, by file name. kind: "webp" where they show frames, else "svg"."""
+def picture_card(picture: Picture) -> Card:
+    """Return the card of pictures made from clips."""
     try:
-        pictures = {"" if not k else f"{k + 1}": _picture(each, figure, kind) for k, (each, figure) in
-                    enumerate(make().items())}  # fmt: skip
+        drawn = [_picture(name, figure, picture.kind) for name, figure in picture.figures().items()]
     except NotRun as reason:
-        return Card(name, title, why=str(reason))
-    return Card(name, title, _fragment("figures", pictures=pictures, alt=title))
+        return Card(picture.name, picture.title, why=str(reason))
+    pictures = {f"{k}" if k > 1 else "": each for k, each in enumerate(drawn, 1)}
+    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
 
 
 def _name(report: TableReport | FigureReport) -> str:

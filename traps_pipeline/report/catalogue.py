@@ -24,7 +24,6 @@ from traps_pipeline.report.tables import (
     setup_tables,
     sub_scenarios,
 )
-from traps_pipeline.report.tables import patching_tables as tables_of_patching
 from traps_pipeline.report.tables import probe_tables as tables_of_probes
 from traps_pipeline.report.tables import steering_tables as tables_of_mechanism
 from traps_pipeline.report.tables.table_columns import printed
@@ -172,7 +171,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("probe_baselines", control_reports.probe_baselines, ("probes", "probe_baselines"),
         title="Probes and their baselines"),
     TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
-    TableReport("patching", tables_of_patching.patching, ("patching",)),
+    TableReport("patching", control_reports.patching, ("patching",)),
     TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_tables.cosines,
         title="Void directions"),
     TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.expression_figures import orders, scored_items
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.control_reports import beside
-from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
+from traps_pipeline.report.tables.inside_columns import SHORTCUTS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,19 +23,23 @@ _SCORES = {"states": "states", "margin": "first token", "sentences": "whole abst
 _CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
 
 
+def _joined(said: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
+    return lambda results: " ".join(said(results))
+
+
 def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     for model, of in rows.groupby("model", sort=False, observed=True):
         yield plain(str(model)), of
 
 
-def states_and_output(results: Results) -> str:
+@_joined
+def states_and_output(results: Results) -> Iterator[str]:
     """Return how many answered voids states and output put among voids, and how well either orders the sides."""
-    sentences = list[str]()
     for model, of in _models(scored_items(results)):
         voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
         controls = of.loc[of["side"] == "control"]
         if not len(voids):
-            sentences.append(f"{model} answered no void under standard: nothing is encoded and not expressed.")
+            yield f"{model} answered no void under standard: nothing is encoded and not expressed."
             continue
         encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
         wrongly = int((controls["own"] > 0).sum())
@@ -43,17 +47,16 @@ def states_and_output(results: Results) -> str:
         means = {
             name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
         }
-        sentences.append(
+        yield (
             f"{model} answered {len(voids)} voids under standard: its states put {encoded} of them among voids (and "
             f"{wrongly} of {len(controls)} controls), its output {expressed}; as orders of the sides (AUROC, mean of "
             f"datasets): {', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
-    return " ".join(sentences)
 
 
-def lens(results: Results) -> str:
+@_joined
+def lens(results: Results) -> Iterator[str]:
     """By how much the guided prompt moves the margin of each side at the last layer and at the one before."""
-    sentences = list[str]()
     for model, of in _models(results.lens):
         means = of.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
@@ -67,34 +70,32 @@ def lens(results: Results) -> str:
             for layer in (top, top - 1)
             for side in ("voids", "controls")
         ]
-        sentences.append(
+        yield (
             f"In {model} the guided prompt moves the log-odds of abstaining by {moved[0]:+.1f} on voids and "
             f"{moved[1]:+.1f} on controls at the last layer, and by {moved[2]:+.1f} and {moved[3]:+.1f} one layer "
             "before (means over datasets)."
         )
-    return " ".join(sentences)
 
 
-def probe_baselines(results: Results) -> str:
+@_joined
+def probe_baselines(results: Results) -> Iterator[str]:
     """On how many pairs states are above every raw input, the margin and the noise; within and across datasets."""
-    sentences = list[str]()
     for model, of in _models(beside(results)):
         states, noise, spread = (of[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
         beaten = np.column_stack([of[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
         above, across = states > np.fmax.reduce(beaten, axis=1), (of["source"] != of["target"]).to_numpy(bool)
         counts = [f"{np.count_nonzero(above & kind)} of {np.count_nonzero(kind)}" for kind in (across, ~across)]
-        sentences.append(
+        yield (
             f"{model}: states are above every raw input, the output margin and noise on {counts[0]} pairs of datasets, "
             f"and on {counts[1]} datasets themselves."
         )
-    return " ".join(sentences)
 
 
-def gate_arrows(results: Results) -> str:
+@_joined
+def gate_arrows(results: Results) -> Iterator[str]:
     """Return what the default gate does to PECS, beside the best gate on anything else than states."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
-    sentences = list[str]()
     for model, of in _models(rows.loc[rows["pecs"].notna()]):
         for regime, part in of.groupby("regime", sort=False, observed=True):
             gates = {row["features"]: row for row in part.to_dict("records")}
@@ -102,17 +103,16 @@ def gate_arrows(results: Results) -> str:
             if own is None or not gates:
                 continue
             best = max(gates.values(), key=lambda row: row["pecs"])
-            sentences.append(
+            yield (
                 f"{model} under {regime}: a gate on states takes PECS from {own['plain_pecs']:.2f} to "
                 f"{own['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
             )
-    return " ".join(sentences)
 
 
-def doses_among_nulls(results: Results) -> str:
+@_joined
+def doses_among_nulls(results: Results) -> Iterator[str]:
     """Return where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
     rows = results.nulls
-    sentences = list[str]()
     for model, of in _models(rows.loc[rows["target"] != "all"]):
         cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
         for row in of.to_dict("records"):
@@ -120,11 +120,10 @@ def doses_among_nulls(results: Results) -> str:
             cells.setdefault(tuple(about[name] for name in _CELL), []).append(about)
         ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
         best = max(ahead, key=lambda row: row["effect"], default=None)
-        sentences.append(
+        yield (
             f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of {len(cells)} cells"
             + (f", most of all {_cell(best)}." if best else ".")
         )
-    return " ".join(sentences)
 
 
 def _cell(row: dict[str, Any]) -> str:
@@ -135,19 +134,18 @@ def _cell(row: dict[str, Any]) -> str:
     )
 
 
-def patching(results: Results) -> str:
+@_joined
+def patching(results: Results) -> Iterator[str]:
     """Return the group of positions that carries most of the difference at the first layer and at the last."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
-    sentences = list[str]()
     for model, of in _models(rows.loc[rows["group"] != "all"]):
         means = of.groupby(["layer", "group"], observed=True).agg(effect=("effect", "mean")).reset_index()
         first, last = (
             max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
             for layer in (of["layer"].min(), of["layer"].max())
         )
-        sentences.append(
+        yield (
             f"In {model} the difference of the output is carried by {first['group']} tokens at the embeddings "
             f"({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."
         )
-    return " ".join(sentences)

@@ -51,6 +51,7 @@ from traps_pipeline.report.writing import (
 from traps_pipeline.scoring.analyses import of_several_runs
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.tables import records
 
 BOUNDS = "If missing: worst, best"
 # Columns that are shown only if their count, or that of another field, is not 0, because the table is wide already.
@@ -149,8 +150,8 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
     others = [name for name in DATASETS if name in datasets and name != ranked]
     own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in others]
     rows = []
-    if robust is not None and ranked == "overall":  # a null text that was read from a file is NaN
-        rows = robust.astype(object).where(robust.notna(), None).to_dict("records")
+    if robust is not None and ranked == "overall":
+        rows = records(robust)
     beside = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
     beside = {key: row for key, row in beside.items() if key in entries}

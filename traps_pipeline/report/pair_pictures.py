@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import DATASETS
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-T = TypeVar("T")
 NO_ITEMS = "this study has no items yet"
 
 
@@ -30,8 +29,8 @@ NO_ITEMS = "this study has no items yet"
 class Picture:
     """One or several figures made from clips, by file name.
 
-    make: raises NotRun, and TrapsError for a damaged clip. inputs: the rows that they show, as JSON; null where all
-    rows of the stages `reads` matter. kind: "webp" where they show frames, else "svg".
+    make: raises NotRun and DamagedClip. inputs: the rows that they show, as JSON; null where all rows of the stages
+    `reads` matter. kind: "webp" where they show frames, else "svg".
     """
 
     name: str
@@ -40,6 +39,13 @@ class Picture:
     reads: tuple[str, ...]
     inputs: Any = None
     kind: str = "webp"
+
+    def figures(self) -> Mapping[str, Figure]:
+        """Return the figures by file name. Raises NotRun, and TrapsError for a damaged clip."""
+        try:
+            return self.make()
+        except DamagedClip as error:
+            raise TrapsError(str(error)) from error
 
 
 class PairPictures:
@@ -79,16 +85,16 @@ class PairPictures:
     def _example(self, example: Example | None) -> Figure:
         if example is None:
             raise NotRun("no pair has both answers judged under standard")
-        return _readable(lambda: example_figure(example, self.workspace.bring(example.pair["clip"])))
+        return example_figure(example, self.workspace.bring(example.pair["clip"]))
 
     def _six(self, rows: pd.DataFrame) -> Figure:
         if not len(rows):
             raise NotRun(NO_ITEMS)
-        return _readable(lambda: pairs_figure(rows, self.workspace.bring(rows["clip"])))
+        return pairs_figure(rows, self.workspace.bring(rows["clip"]))
 
     def _arms(self) -> Mapping[str, Figure]:
         clips = [*self.items["clip"], *self.arms["clip"].dropna()] if len(self.arms) else []
-        sheets = _readable(lambda: arms_sheets(self.items, self.arms, self.workspace.bring(clips))) if clips else {}
+        sheets = arms_sheets(self.items, self.arms, self.workspace.bring(clips)) if clips else {}
         if not sheets:
             raise NotRun("no arm was filmed in this study")
         return sheets
@@ -99,17 +105,7 @@ class PairPictures:
         if not len(self.items):
             raise NotRun(NO_ITEMS)
         videos = self.workspace.tables.read_all(VIDEOS)
-        return shortcut_figure(
-            _readable(lambda: shortcuts(self.items, videos, self.workspace.bring(self.items["clip"])))
-        )
-
-
-def _readable(make: Callable[[], T]) -> T:
-    """Return what is made of clips. Raises TrapsError where one is damaged."""
-    try:
-        return make()
-    except DamagedClip as error:
-        raise TrapsError(str(error)) from error
+        return shortcut_figure(shortcuts(self.items, videos, self.workspace.bring(self.items["clip"])))
 
 
 def _as_json(rows: pd.DataFrame) -> str:

@@ -57,13 +57,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
     pictures = [
-        Part(
-            "pictures",
-            each.name,
-            lambda each=each: picture_card(each.name, each.title, each.make, each.kind),
-            each.reads,
-            each.inputs,
-        )
+        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, each.inputs)
         for each in PairPictures(sources.workspace).all()
     ]
     tables = [
@@ -124,7 +118,7 @@ def _exported(sources: Sources, say: Callable[[str], None]) -> Iterator[tuple[st
     yield from ((f"tables/{RECOMPUTED}/{name}", content) for name, content in table_files(audit_table()).items())
     for picture in PairPictures(sources.workspace).all():
         try:
-            figures = picture.make()
+            figures = picture.figures()
         except NotRun:
             continue
         for name, figure in figures.items():

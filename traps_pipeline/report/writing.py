@@ -284,12 +284,12 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
 
 
 @cache
-def environment() -> jinja2.Environment:
+def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
     """Return the Jinja2 environment of every page: all text is escaped, and an unknown name is an error."""
     import jinja2
 
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
+        loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
         finalize=finalized,
         undefined=jinja2.StrictUndefined,

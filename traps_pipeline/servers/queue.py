@@ -34,11 +34,7 @@ def flags(workspace: Workspace) -> pd.DataFrame:
 
 
 def queue(
-    name: QueueName,
-    scenarios: Sequence[str],
-    reviewed: frozenset[str],
-    found: pd.DataFrame,
-    alike: Mapping[str, float],
+    name: QueueName, scenarios: Sequence[str], reviewed: frozenset[str], found: pd.DataFrame, alike: Mapping[str, float]
 ) -> list[str]:
     """Return the scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. found:
     `flags`; alike: by scenario, how far the one that looks most alike is."""

@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import jinja2
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import finalized
 from traps_pipeline.base.webguard import Guard
 from traps_pipeline.report.explorer.site import WEB as SHARED
+from traps_pipeline.report.writing import environment
 from traps_pipeline.storage.workspace import Workspace
 
 WEB = Path(__file__).parent / "web"
@@ -58,24 +57,11 @@ def new_app() -> FastAPI:
     return app
 
 
-@cache
-def templates() -> jinja2.Environment:
-    """Return the templates of the pages; all text is escaped, and an unknown name is an error."""
-    return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(WEB),
-        autoescape=True,
-        finalize=finalized,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-
-
 def page(template: str, **values: Any) -> str:
     """Return a page with the explorer's look. Its policy lets it load its own scripts, clips and pictures alone."""
     style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
-    return templates().get_template(template).render(style=style, style_digest=digest, **values)
+    return environment(WEB).get_template(template).render(style=style, style_digest=digest, **values)
 
 
 @cache

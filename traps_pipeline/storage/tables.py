@@ -27,6 +27,7 @@ from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
 
 Row = TypeVar("Row")
@@ -134,3 +135,9 @@ def _columns(row_type: type[Any]) -> Iterator[StoredColumn]:
             known = ", ".join(map(str, TYPES))
             raise TypeError(f"{row_type.__name__}.{name}: a column holds one of {known}, or None, and has a text")
         yield StoredColumn(name, types[0], NoneType in members, doc)
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows as JSON has them: None where a value is missing, lists for arrays."""
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return [{str(k): v.tolist() if hasattr(v, "tolist") else v for k, v in row.items()} for row in rows]

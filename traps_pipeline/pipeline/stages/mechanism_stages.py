@@ -85,11 +85,7 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
 @_stage(
     PROBE_ITEMS,
     code="2",
-    parents=[
-        of(items, to_keys(DATASET, PROBED, _probed_from)),
-        of(scene_specs, _OCCLUSION),
-        of(videos, _OCCLUSION),
-    ],
+    parents=[of(items, to_keys(DATASET, PROBED, _probed_from)), of(scene_specs, _OCCLUSION), of(videos, _OCCLUSION)],
     scheme=PROBED,
 )
 def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
@@ -183,11 +179,7 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
 @_stage(
     STEERING_TABLE,
     code="4",
-    parents=[
-        of(items, by_dataset),
-        of(directions, EVERY, need="some"),
-        of(steering_settings, schemes.by_steering),
-    ],
+    parents=[of(items, by_dataset), of(directions, EVERY, need="some"), of(steering_settings, schemes.by_steering)],
     scheme=schemes.STEERING,
     kinds=["parquet", "pytorch"],
     cost="machine",

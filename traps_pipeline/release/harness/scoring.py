@@ -81,10 +81,7 @@ def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
         decided = [value for value in values if value is not None]
         results[figure] = sum(decided) / len(DATASETS) if len(decided) == len(DATASETS) else None
     undecided = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
-    return results | {
-        "missing": float(len(undecided)),
-        "unread": float(sum(row.outcome == UNREAD for row in rows)),
-    }
+    return results | {"missing": float(len(undecided)), "unread": float(sum(row.outcome == UNREAD for row in rows))}
 
 
 def _of_dataset(rows: list[Judged]) -> dict[str, float | None]:

@@ -153,20 +153,9 @@ def _evaluations(responses: pa.Table) -> list[Evaluation]:
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
     """Return the rows with `key`, the place of item and evaluation; without those of evaluations without answers."""
-    place = {(e.model, e.regime, e.run): k for k, e in enumerate(evaluations)}
-    columns = [rows[name].combine_chunks().dictionary_encode() for name in _EVALUATION]
-    sizes = [len(column.dictionary) for column in columns]
-    codes = np.zeros(len(rows), np.int64)
-    for column, size in zip(columns, sizes, strict=True):
-        codes = codes * size + column.indices.to_numpy()
-    used = np.unique(codes)
-    values = [column.dictionary.to_pylist() for column in columns]
-    of_code = np.full(int(used.max()) + 1 if len(used) else 1, -1, np.int64)
-    for code in used.tolist():
-        rest, run = divmod(code, sizes[2])
-        model, regime = divmod(rest, sizes[1])
-        of_code[code] = place.get((values[0][model], values[1][regime], values[2][run]), -1)
-    evaluation = of_code[codes]
+    own = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
+    known = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
+    evaluation = pc.fill_null(pc.index_in(own, value_set=known), -1).to_numpy().astype(np.int64)
     key = rows["item"].to_numpy() * max(len(evaluations), 1) + evaluation
     return rows.append_column("key", pa.array(key)).filter(pa.array(evaluation >= 0))
 

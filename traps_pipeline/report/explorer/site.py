@@ -40,6 +40,7 @@ from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
 from traps_pipeline.scoring.analyses import REASONING_PAIRS
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
+from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -206,32 +207,21 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "epochs": [*answers.epochs],
         "shards": shards,
         "n_votes": len(answers.votes),
-        "leaderboard": _records(board),
-        "robust": _records(robust),
-        "people": _records(human_row),
+        "leaderboard": records(board),
+        "robust": records(robust),
+        "people": records(human_row),
         "said": said_by_people(human_row, workspace.tables.read_all(PANEL_ERRORS)),
-        "published": _records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
+        "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,
         "reasoning_pairs": [*map(list, REASONING_PAIRS)],
     }
 
 
-def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows as JSON values; a missing value is null."""
-    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    return [{str(name): _plain(value) for name, value in row.items()} for row in rows]
-
-
-def _plain(value: Any) -> Any:
-    """Return a value of a frame as JSON has it."""
-    return value.tolist() if hasattr(value, "tolist") else value
-
-
 def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
     """Return what the page of a pair says about its scenario, by scenario."""
     specs, videos = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
-    clips = {(row["scenario_id"], row["side"]): row for row in _records(videos)}
+    clips = {(row["scenario_id"], row["side"]): row for row in records(videos)}
     rows = []
     for spec in sorted(specs.to_dict("records"), key=lambda row: row["scenario_id"]):
         twin, evidence = json.loads(spec["twin"]), json.loads(spec["evidence"])

@@ -8,7 +8,7 @@ import numpy as np
 
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
+from traps_pipeline.report.figures.looks import families, family_colour, family_of, legend_key, looks
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
@@ -78,12 +78,10 @@ def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _draw_models_key(figure: Figure, models: list[str]) -> None:
-    from matplotlib.lines import Line2D
-
     look = looks(models)
-    handles = [Line2D([], [], linestyle="none", marker=look[m][1], markersize=4.5, color=look[m][0]) for m in models]
-    names = [plain(model)[:26] for model in models]
-    figure.legend(handles, names, loc="outside lower center", ncols=5, fontsize=6, handletextpad=0.1, columnspacing=0.8)
+    handles = [legend_key(plain(model)[:26], *look[model], size=4.5) for model in models]
+    style: dict[str, Any] = {"fontsize": 6, "handletextpad": 0.1, "columnspacing": 0.8}
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, **style)
 
 
 def abs_rec_by_model(results: Results) -> Figure:

@@ -10,12 +10,10 @@ import numpy as np
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to
+from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to, legend_key
 from traps_pipeline.report.result_frames import Results, datasets_of
-from traps_pipeline.report.tables.control_reports import beside
-from traps_pipeline.report.tables.inside_columns import few, why
-from traps_pipeline.report.tables.patching_tables import SITES
-from traps_pipeline.report.tables.probe_baselines import SHORTCUTS
+from traps_pipeline.report.tables.control_reports import SITES, beside
+from traps_pipeline.report.tables.inside_columns import SHORTCUTS, few, why
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
     COLOURS,
@@ -49,8 +47,6 @@ def probe_baselines(results: Results) -> Figure:
     rows = beside(results)
     if not len(rows):
         raise NotRun(why(results))
-    from matplotlib.lines import Line2D
-
     models = list(dict.fromkeys(rows["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 0.9 + 2.4 * len(models))
@@ -60,12 +56,10 @@ def probe_baselines(results: Results) -> Figure:
             sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
             ax.set_title(f"{plain(model)[:40]}, {from_to(sides.min(), sides.max())} items a side", size=7.5)
             ax.set_ylabel("AUROC")
-        handles = [Line2D([], [], color=INK, marker="o", markersize=4, label="states, layer chosen without the target")]
-        handles += [
-            Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=4, label=name)
-            for (name, marker), colour in zip(_BASELINES.items(), COLOURS, strict=False)
-        ]
-        handles += [Line2D([], [], color=GRID, linewidth=6, label="noise, mean ± 2 sd")]
+        handles = [legend_key("states, layer chosen without the target", INK, "o", "-")]
+        looks = zip(_BASELINES.items(), COLOURS, strict=False)
+        handles += [legend_key(name, colour, marker) for (name, marker), colour in looks]
+        handles += [legend_key("noise, mean ± 2 sd", GRID, line="-", linewidth=6)]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
@@ -102,8 +96,6 @@ def gate_arrows(results: Results) -> Figure:
     rows = rows.loc[rows["features"].isin(_FEATURES)]
     if not len(rows):
         raise NotRun(why(results, "the paper gates nothing"))
-    from matplotlib.lines import Line2D
-
     regimes = [name for name in PROMPTING if name in set(rows["regime"])]
     colour = _colours(_FEATURES)
     rows = rows.assign(j=rows["abs_rec"] - rows["false_abs"], plain_j=rows["plain_abs_rec"] - rows["plain_false_abs"])
@@ -115,9 +107,9 @@ def gate_arrows(results: Results) -> Figure:
             _arrows(ax, part, colour)
             ax.set_title(f"{regime}, {plain(' and '.join(dict.fromkeys(part['model'])))[:30]}", size=7.5)
         _risk(panels[-1], results.risk_coverage, regimes[-1], colour)
-        handles = [Line2D([], [], color=colour[f], marker="o", markersize=4, label=f"gate on {f}") for f in
-                   _FEATURES if f in set(rows["features"])]  # fmt: skip
-        handles += [Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="none", label="no gate")]
+        shown = [name for name in _FEATURES if name in set(rows["features"])]
+        handles = [legend_key(f"gate on {name}", colour[name], "o", "-") for name in shown]
+        handles += [legend_key("no gate", INK, "o", size=6, markerfacecolor="white")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
@@ -228,8 +220,6 @@ def doses_among_nulls(results: Results) -> Figure:
     rows = results.own_effects
     if not len(rows):
         raise NotRun(why(results, "the paper has no such nulls"))
-    from matplotlib.lines import Line2D
-
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
     datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
     with figure_style():
@@ -248,12 +238,8 @@ def doses_among_nulls(results: Results) -> Figure:
         for ax in axes[-1]:
             ax.set_xlabel("dose in class gaps | nulls", size=7)
         axes[0, 0].set_ylim(-6, 106)
-        handles = [Line2D([], [], color=INK, marker="o", markersize=3.5, label="+ on controls")]
-        handles += [Line2D([], [], color=SOFT, marker="s", markersize=3.5, linestyle="--", label="− on voids")]
-        handles += [
-            Line2D([], [], linestyle="none", marker="o", markersize=3, color=colour[null], label=f"{null} null")
-            for null in NULLS
-        ]
+        handles = [legend_key("+ on controls", INK, "o", "-", 3.5), legend_key("− on voids", SOFT, "s", "--", 3.5)]
+        handles += [legend_key(f"{null} null", colour[null], "o", size=3) for null in NULLS]
         figure.legend(handles=handles, loc="outside lower center", ncols=5)
     return figure
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING, STANDARD
+from traps_pipeline.report.figures.looks import legend_key
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, NotRun, figure_style, new_figure, plain
@@ -33,8 +34,6 @@ def states_and_output(results: Results) -> Figure:
     rows = scored_items(results)
     if not len(rows):
         raise NotRun(why(results, "the paper prints no scores of items"))
-    from matplotlib.lines import Line2D
-
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.6 + 2.1 * len(models))
@@ -49,12 +48,10 @@ def states_and_output(results: Results) -> Figure:
             line[0].set_ylabel("states: log-odds of void")
         for ax in axes[-1]:
             ax.set_xlabel("output: log-odds of abstaining", size=7)
-        marker: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4}
         handles = [
-            Line2D([], [], color=VOID, label="void, answered", **marker),
-            Line2D([], [], color=VOID, markerfacecolor="white", label="void, abstained", **marker),
-            Line2D([], [], color=CONTROL, label="control, answered", **marker),
-            Line2D([], [], color=CONTROL, markerfacecolor="white", label="control, abstained", **marker),
+            legend_key(f"{side}, {said}", colour, "o", markerfacecolor=face or colour)
+            for side, colour in (("void", VOID), ("control", CONTROL))
+            for said, face in (("answered", ""), ("abstained", "white"))
         ]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
@@ -103,7 +100,6 @@ def lens(results: Results) -> Figure:
     rows = results.lens
     if not len(rows):
         raise NotRun(why(results, "the paper has no such curves"))
-    from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator
 
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
@@ -124,7 +120,7 @@ def lens(results: Results) -> Figure:
         for ax in axes[-1]:
             ax.set_xlabel("layer (0: embeddings)")
         handles = [
-            Line2D([], [], color=colour, linestyle=style, label=f"{side}, {prompt}")
+            legend_key(f"{side}, {prompt}", colour, line=style)
             for side, colour in (("voids", VOID), ("controls", CONTROL))
             for prompt, style in _LINES.items()
         ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merged_labels, place_labels, short
-from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
+from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
@@ -150,21 +150,15 @@ def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
 
 
 def _draw_key(figure: Figure) -> None:
-    from matplotlib.lines import Line2D
-
-    def handle(size: float, face: str, edge: str = "#475467") -> Line2D:
-        return Line2D([], [], linestyle="none", marker="o", markersize=size, color=edge, markerfacecolor=face)
-
-    handles = {
-        "standard": handle(4.5, "white"),
-        "guided": handle(4.5, "#475467"),
-        "json": handle(1.6, "#475467"),
-        "family’s best, guided": handle(7, "none", INK),
-        "frontier, guided": Line2D([], [], color=INK, linewidth=0.7, linestyle=(0, (4, 2.5))),
-    }
-    figure.legend(
-        [*handles.values()], [*handles], loc="outside lower center", ncols=3, handletextpad=0.4, columnspacing=1.2
-    )
+    handles = [
+        legend_key("standard", "#475467", "o", size=4.5, markerfacecolor="white"),
+        legend_key("guided", "#475467", "o", size=4.5),
+        legend_key("json", "#475467", "o", size=1.6),
+        legend_key("family’s best, guided", INK, "o", size=7, markerfacecolor="none"),
+        legend_key("frontier, guided", INK, line=(0, (4, 2.5)), linewidth=0.7),
+    ]
+    style: dict[str, Any] = {"handletextpad": 0.4, "columnspacing": 1.2}
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, **style)
 
 
 def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> list[Label]:

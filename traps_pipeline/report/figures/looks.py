@@ -13,6 +13,7 @@ from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, SOFT
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
 OWN, REFERENCE = "own", "reference"
 
@@ -69,6 +70,13 @@ def _limits(values: pd.Series, low: float, least: float) -> tuple[float, float]:
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)
     top = min(1.0, max(least, float(np.ceil(10 * values.max() + 0.8)) / 10))
     return min(bottom, top - 0.5) if not least else bottom, top
+
+
+def legend_key(label: str, colour: str, marker: str = "", line: Any = "none", size: float = 4, **look: Any) -> Line2D:
+    """Return an entry of a legend: a marker of some size, a line, or both."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, color=colour, marker=marker, linestyle=line, markersize=size, **look)
 
 
 def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str) -> None:

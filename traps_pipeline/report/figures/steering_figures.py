@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
-from traps_pipeline.report.figures.looks import from_to
+from traps_pipeline.report.figures.looks import from_to, legend_key
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.probe_tables import best_layers
@@ -38,34 +38,15 @@ SETS = {"transfer": "transfer", "within_domain": "within"}
 
 def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) -> None:
     """Sources by colour and line, targets by marker, below the panels."""
-    from matplotlib.lines import Line2D
-
-    sources = [Line2D([], [], color=colours[d], linestyle=LINE[d], label=f"from {TITLES[d].lower()}") for d in DATASETS]
-    targets = [
-        Line2D([], [], color=SOFT, linestyle="none", marker=MARKER[d], markersize=3.5, label=f"to {TITLES[d].lower()}")
-        for d in DATASETS
-    ]
+    sources = [legend_key(f"from {TITLES[d].lower()}", colours[d], line=LINE[d]) for d in DATASETS]
+    targets = [legend_key(f"to {TITLES[d].lower()}", SOFT, MARKER[d], size=3.5) for d in DATASETS]
     handles = [*sources, *targets, *more]
     style: dict[str, Any] = {"columnspacing": 1.0, "handlelength": 2.0, "handletextpad": 0.4}
     figure.legend(handles=handles, loc="outside lower center", ncols=4, **style)
 
 
-def _key(label: str, face: str) -> Line2D:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=SOFT, linestyle="none", marker="o", markersize=4, markerfacecolor=face, label=label)
-
-
-def _chance_key() -> Line2D:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=SOFT, linewidth=0.8, linestyle=(0, (4, 2.5)), label="chance")
-
-
 def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=color, linewidth=width, solid_capstyle="butt", label=label)
+    return legend_key(label, color, line="-", linewidth=width, solid_capstyle="butt")
 
 
 def probe_curves(results: Results) -> Figure:
@@ -90,7 +71,7 @@ def probe_curves(results: Results) -> Figure:
             ax.set_xlabel("layer (0: embeddings)")
         axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
         shuffled = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
-        _legend(figure, _key("layer chosen without the target", "white"), shuffled)
+        _legend(figure, legend_key("layer chosen without the target", SOFT, "o", markerfacecolor="white"), shuffled)
     return figure
 
 
@@ -138,7 +119,9 @@ def confabulated_strip(results: Results) -> Figure:
             ax.set_title(plain(model)[:30], size=7.5)
         lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
         axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
-        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT), _bar_key("median of Cf→Cf"), _chance_key())
+        chance = legend_key("chance", SOFT, line=(0, (4, 2.5)), linewidth=0.8)
+        hollow, filled = legend_key("all samples", SOFT, "o", markerfacecolor="white"), legend_key("Cf→Cf", SOFT, "o")
+        _legend(figure, hollow, filled, _bar_key("median of Cf→Cf"), chance)
     return figure
 
 

@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import DATASET, MODEL, REGIME, RUNS, ordered, titled
-from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, fraction, percent
+from traps_pipeline.report.tables.table_columns import (
+    DATASET,
+    MODEL,
+    REGIME,
+    RUNS,
+    figure_with_interval,
+    ordered,
+    titled,
+)
+from traps_pipeline.report.writing import NOT_RUN, Column, PrintedTable, fraction, percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,9 +98,7 @@ def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
 
 
 def _shown(row: Mapping[Any, Any], field: str) -> str:
-    figure = percent if field.removesuffix("_corrected") in _PERCENT else fraction
-    own, low, high = (figure(row[name]) for name in (field, f"{field}_ci_low", f"{field}_ci_high"))
-    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
+    return figure_with_interval(row, field, percent if field.removesuffix("_corrected") in _PERCENT else fraction)
 
 
 def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:

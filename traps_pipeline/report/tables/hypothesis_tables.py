@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, ordered
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, ordered
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, percent
 
 if TYPE_CHECKING:
@@ -36,7 +36,10 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     own = rows.loc[rows["hypothesis"] == hypothesis.name]
     place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
     own = own.assign(place=own["dose"].map(place))
-    shown = {f"{name}_shown": [_figure(row, name) for row in own.to_dict("records")] for name in (*_HEADINGS, "change")}
+    shown = {
+        f"{name}_shown": [figure_with_interval(row, name, percent) for row in own.to_dict("records")]
+        for name in (*_HEADINGS, "change")
+    }
     rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
     own = own.assign(**shown, **{f"rule_{name}": values for name, values in rules.items()})
     what = "J" if hypothesis.figure == "j" else "abstentions"
@@ -64,11 +67,6 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     rows = ordered(own, ["model", "regime", "place"])
     name = f"hypothesis_{hypothesis.name.replace(' ', '_')}"
     return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(own) else [], WHY)
-
-
-def _figure(row: Mapping[Any, Any], name: str) -> str:
-    own, low, high = (percent(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
-    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
 
 
 def _rule(row: Mapping[Any, Any], name: str) -> str:

@@ -1,9 +1,10 @@
-"""Columns, marks and notes that tables of what is found inside models share."""
+"""Columns, marks and notes that tables of what is found inside models share, and what stands beside a probe's figures:
+the best of the raw inputs, the output margin and the floor of noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.mechanism.transfer_paths import path_name
 from traps_pipeline.protocol.datasets import SHORT
@@ -21,6 +22,18 @@ DRAWS = "± standard deviation over draws of noise"
 NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's states were read"
 FEW = 10  # items of a side, or answers of a cell, below which a value is marked
 FEW_MARK = "†"
+SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stamps")
+KEYS = ["model", "source", "target"]
+AT = ["model", "prompt", "analysis", "source", "target"]
+NO_RAW = "none above .5"
+BESIDE = ("raw", "raw_value", "margin", "noise", "noise_spread")
+BASELINE_NOTES = (
+    "best raw input: the one of question words, first frame, all frames, length and time stamps with the highest "
+    "AUROC, by the same protocol; output margin: log-odds that the first answer token begins an abstention; noise: "
+    "random vectors as wide as states, mean ± deviation over draws",
+    "a probe says nothing about understanding where a raw input is as high, and nothing about a gap between states and "
+    "output where the margin is",
+)
 
 
 def why(results: Results, of_paper: str = "") -> str:
@@ -60,3 +73,54 @@ def short_names(names: Iterable[str]) -> list[str]:
 def path_names(rows: pd.DataFrame) -> list[str]:
     """Return the path of each row, from its source to its target."""
     return [path_name(source, target) for source, target in zip(rows["source"], rows["target"], strict=True)]
+
+
+def by_features(results: Results) -> pd.DataFrame:
+    """Return a row per AT of `probe_baselines`: the value of each of its features, and noise_spread."""
+    import pandas as pd
+
+    rows = results.baselines
+    wide = rows.pivot_table(index=AT, columns="features", values="value", observed=True)
+    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise", *other_probes(results)]))
+    spread = rows.loc[rows["features"] == "noise"].set_index(AT)["spread"]
+    return wide.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(AT, object))
+
+
+def other_probes(results: Results) -> list[str]:
+    """Return the further probes of the states that experiments name, as features of `probe_baselines`."""
+    return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
+
+
+def against(results: Results, analysis: str) -> pd.DataFrame:
+    """Return BESIDE of each model, source and target under an analysis: best raw input, output margin and noise."""
+    import pandas as pd
+
+    rows = by_features(results)
+    rows = rows.loc[rows["analysis"] == analysis].set_index(KEYS)
+    raw = rows[[*SHORTCUTS]].astype(float)
+    best = [best_name(row) for row in raw.to_dict("records")]
+    own = rows[["output margin", "noise", "noise_spread"]].rename(columns={"output margin": "margin"})
+    return pd.DataFrame({"raw": best, "raw_value": raw.max(axis=1)}, index=rows.index).join(own)
+
+
+def best_name(values: Mapping[Any, float]) -> str:
+    """Return the feature with the highest AUROC; NO_RAW where none is above chance, empty where there is none."""
+    known = {str(name): value for name, value in values.items() if value == value}
+    best = max(known, key=lambda name: known[name], default="")
+    return NO_RAW if best and known[best] <= 0.5 else best
+
+
+def baseline_columns(results: Results, prefix: str = "", head: str = "") -> list[Column]:
+    """Return the columns of BESIDE; none for the paper, which has no baselines."""
+    if not results.is_study:
+        return []
+    return [
+        Column(f"{prefix}raw", f"{head}Best raw input"), Column(f"{prefix}raw_value", f"{head}its AUROC", "fraction"),
+        Column(f"{prefix}margin", f"{head}Output margin", "fraction"),
+        Column(f"{prefix}noise", f"{head}Noise", "fraction", spread=f"{prefix}noise_spread"),
+    ]  # fmt: skip
+
+
+def baseline_notes(results: Results) -> list[str]:
+    """Return what the columns of BESIDE are; nothing of the paper, which has none."""
+    return [*BASELINE_NOTES] if results.is_study else []

@@ -11,20 +11,24 @@ from traps_pipeline.mechanism.layer_choice import ROUNDING, layer_choice, pair_c
 from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.protocol.datasets import SHORT, transfer_type
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables import probe_baselines
 from traps_pipeline.report.tables.inside_columns import (
+    BASELINE_NOTES,
     DRAWS,
+    KEYS,
     LAYER,
     PATH,
+    SHORTCUTS,
     SIDES,
     TYPE,
+    against,
+    baseline_columns,
+    baseline_notes,
     few,
     few_note,
     interval,
     short_names,
     why,
 )
-from traps_pipeline.report.tables.probe_baselines import KEYS
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
@@ -65,12 +69,7 @@ PAIR_FIGURES = {
     "cf_held_out": At("confabulated_held_out", "all_sample_best"),
 }
 # The analyses whose baselines stand beside a pair's figures, by the prefix of their columns.
-BASELINES = {
-    "": "transfer",
-    "cf_": "confabulated",
-    "held_": "held_out",
-    "cf_held_": "confabulated_held_out",
-}
+BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_held_": "confabulated_held_out"}
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
@@ -107,13 +106,13 @@ def _pairs(results: Results) -> pd.DataFrame:
     if not len(rows):
         return rows
     for prefix, analysis in BASELINES.items():
-        rows = rows.join(probe_baselines.against(results, analysis).add_prefix(prefix), on=KEYS)
+        rows = rows.join(against(results, analysis).add_prefix(prefix), on=KEYS)
     return _marked(rows)
 
 
 def _marked(rows: pd.DataFrame) -> pd.DataFrame:
-    marks = {"mark": few(rows, "best_n_voids", "best_n_controls"), "cf_mark": few(rows, "cf_n_voids", "cf_n_controls")}
-    return rows.assign(**marks)
+    cf = few(rows, "cf_n_voids", "cf_n_controls")
+    return rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"), cf_mark=cf)
 
 
 def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
@@ -125,7 +124,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"),
         Column("best_value", "AUROC", "fraction", mark="mark"), *interval("best_"),
         Column("chosen_layer", "Chosen layer", "count"), Column("chosen_value", "AUROC there", "fraction"),
-        *_held_out(results), *probe_baselines.columns(results), *([] if results.is_study else cf),
+        *_held_out(results), *baseline_columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -133,7 +132,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         "probes carry over best to each other, which uses no pair of the target (table of layers)",
         *_shared_controls(results),
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
-        *probe_baselines.notes(results),
+        *baseline_notes(results),
         *few_note(rows),
     ]
     title = "Probe transfer: AUROC by ordered pair"
@@ -147,7 +146,7 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out(results, "cf_"),
         Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
-        *probe_baselines.columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
+        *baseline_columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
         Column("cf_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -155,7 +154,7 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         "control; best layer: that of all samples",
         *_shared_controls(results),
         *silent,
-        *probe_baselines.notes(results),
+        *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
     absent = why(results, "the paper has these figures in its table of probe transfer")
@@ -171,22 +170,20 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
         figures = [*(f"{name}_value" for name in PAIR_FIGURES), *beside, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
-        by = {
-            **dict.fromkeys(figures, "mean"),
-            **dict.fromkeys(("raw", "cf_raw"), _listed),
-            **dict.fromkeys(sides, "min"),
-        }
+        by = (
+            dict[str, Any].fromkeys(figures, "mean") | {"raw": _listed, "cf_raw": _listed} | dict.fromkeys(sides, "min")
+        )
         groups = rows.groupby(["model", "transfer_type"], sort=False)
         rows = _marked(groups.agg(by).assign(n_paths=groups.size()).reset_index())
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("chosen_value", "Chosen layer", "fraction", mark="mark"),
-        *_held_out(results), *probe_baselines.columns(results),
+        *_held_out(results), *baseline_columns(results),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
         Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
-        *probe_baselines.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"),
+        *baseline_columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
-    notes = [*_shared_controls(results), *probe_baselines.notes(results), *few_note(rows, "mark", "cf_mark")]
+    notes = [*_shared_controls(results), *baseline_notes(results), *few_note(rows, "mark", "cf_mark")]
     if results.is_study:
         columns += [
             Column("best_n_voids", "Fewest voids", "count"), Column("best_n_controls", "Fewest controls", "count"),
@@ -234,7 +231,7 @@ def _within(results: Results) -> PrintedTable:
     itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
     itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
     table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
-    table = table.join(probe_baselines.against(results, "held_out"), on=KEYS)
+    table = table.join(against(results, "held_out"), on=KEYS)
     table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
@@ -244,12 +241,12 @@ def _within(results: Results) -> PrintedTable:
     notes = ["cross-validated, folds by scenario; shuffled: mean over shuffles and layers ± deviation over shuffles"]
     if results.is_study:
         columns += [
-            Column("pooled", "Over all folds", "fraction"), *interval(), *probe_baselines.columns(results), *SIDES,
+            Column("pooled", "Over all folds", "fraction"), *interval(), *baseline_columns(results), *SIDES,
         ]  # fmt: skip
         notes += [
             "AUROC: mean over folds; over all folds: of the scores of all folds together, with its 95 % interval from "
             "resampled scenarios; baselines are to be compared with it",
-            *probe_baselines.NOTES,
+            *BASELINE_NOTES,
         ]
     notes += few_note(table)
     title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
@@ -310,7 +307,7 @@ def _caught_beside(results: Results) -> pd.DataFrame:
     wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
     wide.columns = pd.Index([*keys, "features", "void", "control"])
     order = wide.assign(above=wide["void"] - wide["control"]).sort_values("above", ascending=False, kind="stable")
-    raw = order.loc[order["features"].isin(probe_baselines.SHORTCUTS)].drop_duplicates(keys).set_index(keys)
+    raw = order.loc[order["features"].isin(SHORTCUTS)].drop_duplicates(keys).set_index(keys)
     table = raw[["features"]].rename(columns={"features": "raw"})
     kinds = {"raw": raw} | {
         name: wide.loc[wide["features"] == features].set_index(keys)

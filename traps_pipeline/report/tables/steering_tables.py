@@ -76,8 +76,7 @@ def _named_directions(rows: pd.DataFrame, prefix: str) -> list[str]:
 def _place(values: pd.Series) -> pd.Series:
     if values.name == "name":
         return values.map({short: place for place, short in enumerate(SHORT.values())})
-    orders = {"prompt": PROMPTING, "kind": KINDS}
-    order = orders.get(str(values.name))
+    order = {"prompt": PROMPTING, "kind": KINDS}.get(str(values.name))
     return values if order is None else values.map(order.index)
 
 
@@ -160,26 +159,19 @@ def _top(results: Results) -> PrintedTable:
     rows = effects.paths(results.effects)
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _named(rows)
-    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results)]
-    columns += [*_SIDES, *_counts(results)]
+    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results), *_SIDES, *_counts(results)]
     return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
 
 
 def _dose(results: Results) -> PrintedTable:
     rows = _named(effects.paths(results.effects))
-    columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, LAYER]
-    columns += [ALPHA, *_in_gaps(results)]
+    columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, LAYER, ALPHA, *_in_gaps(results)]
     for side in _SIDES:
-        columns += [side]
-        if results.is_study:
-            columns += interval(f"{side.field}_", "percent")
+        columns += [side, *(interval(f"{side.field}_", "percent") if results.is_study else ())]
     columns += _counts(results)
-    notes = [
-        epochs(results.effects),
-        *_cell_notes(results),
-        "from, to: 95 % Wilson interval" if results.is_study else "",
-    ]
-    return PrintedTable("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], why(results))
+    notes = [epochs(results.effects), *_cell_notes(results)]
+    notes += ["from, to: 95 % Wilson interval"] * results.is_study
+    return PrintedTable("steering_dose", "Dose and response", rows, columns, notes, why(results))
 
 
 def _layers(results: Results) -> PrintedTable:

@@ -20,9 +20,7 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
     """Return means over models of every occlusion sub-scenario, and the hidden ones compared with the others."""
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
-    hidden = rows.iloc[:0]
-    if len(rows):
-        hidden = analyses.hidden_against_others(rows)
+    hidden = analyses.hidden_against_others(rows) if len(rows) else rows
     columns = [
         Column("kind", "Sub-scenarios"), Column("n", "Number", "count"),
         Column("abs_rec", "AbsRec %, standard", "percent"), Column("guided_abs_rec", "AbsRec %, guided", "percent"),
@@ -71,17 +69,14 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
         Column("abs_rec_ill_posed", "AbsRec %, ill-posed", "percent"),
         Column("textual_over_visual", "Textual / visual", "ratio"), MISSING,
     ]  # fmt: skip
-    notes = [epochs(rows), "means over models" + (_left_out(results)), "standard, where no regime is named"]
+    left_out = "; reference strategies left out where others were asked" if results.is_study else ""
+    notes = [epochs(rows), f"means over models{left_out}", "standard, where no regime is named"]
     fewer = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
     if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in fewer.values()):
         columns += [Column(name, f"Models, {what}", "count") for what, name in fewer.items()]
     notes += marks(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
-
-
-def _left_out(results: Results) -> str:
-    return "; reference strategies left out where others were asked" if results.is_study else ""
 
 
 def _sub_trace(taxonomy: str) -> Trace:

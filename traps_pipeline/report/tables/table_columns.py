@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, fraction
+from traps_pipeline.report.writing import NONE, Behind, Column, PrintedTable, fraction
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -139,6 +139,12 @@ def interval(row: Mapping[str, Any]) -> str:
     """Return the interval of PECS as printed; empty if there is none."""
     low, high = row.get("pecs_ci_low"), row.get("pecs_ci_high")
     return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
+
+
+def figure_with_interval(row: Mapping[Any, Any], name: str, as_printed: Callable[[float], str]) -> str:
+    """Return a figure as printed, with its interval in brackets where it has one."""
+    own, low, high = (as_printed(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
+    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:
