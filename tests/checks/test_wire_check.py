@@ -211,7 +211,7 @@ def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPa
         ),
         pytest.param(
             altered("qwen3-vl-think", {"response_format": answer_object(FIELDS["json"])}),
-            "standard: structured output is for the JSON regime alone",
+            "standard: structured output is for regimes that ask for an object",
             id="a schema in every regime",
         ),
     ],

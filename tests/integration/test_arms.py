@@ -12,7 +12,7 @@ from tests.conftest import Checkout
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
-from traps_pipeline.scoring.score_rows import HYPOTHESES, LEADERBOARD, ROBUST
+from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, ROBUST
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -26,7 +26,7 @@ epoch: small
 scenarios: [hidden_race-0001, plinko-0001]
 datasets:
   [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, decoy, twin_control, crossed,
-   labels_two, labels_six, panel_grey, schema_abstain, frames_few]
+   labels_two, labels_six, panel_grey, schema_abstain, frames_few, graded]
 """
 
 
@@ -36,15 +36,22 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     other = Checkout(study.root, tmp_path / "armed")
     (tmp_path / "armed").mkdir()
     (study.workspace / "clips").rename(other.workspace / "clips")
-    until = ("--until", "leaderboard,robust,hypotheses")
+    until = ("--until", "leaderboard,robust,hypotheses,graded")
     run = other.traps("run", path, *until)
     assert run.code == 0, run.err
     # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 2 x 2.
-    # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each.
-    assert run.counts()["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4))
-    assert run.counts()["frames"] == 50 + 50  # decoy and grey; the others show the pair's own clips
+    # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each. A graded cut.
+    assert run.counts()["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4) + 1)
     tables = Workspace.open(other.workspace).tables
     arms = tables.read_all(ARMS)
+    cut = arms.set_index("arm").loc["graded"]
+    # Decoy and grey, and the graded cut; the others show the pair's own clips.
+    assert run.counts()["frames"] == 50 + 50 + cut["n_frames"]
+    posterior, truth = json.loads(cut["evidence"])["posterior"], load_released()["plinko-0001"].ground_truth
+    graded = tables.read_all(GRADED_CUTS).query("scope == 'all'").set_index("model")
+    assert graded.loc["oracle", "points"] == pytest.approx(4 * posterior[truth] - 3)  # it knows what came of it
+    assert graded.loc["oracle", "points_best"] == pytest.approx(4 * max(posterior.values()) - 3)
+    assert (graded.loc["any-rule", ["coverage", "points"]] == 0).all()  # it takes a short clip for a void
     (refused,) = arms.dropna(subset=["refused"])["scenario_id"].unique()
     assert refused == "plinko-0001"  # the numbers of its buckets are no colours
     items = tables.read_all(ITEMS, dataset="crossed").set_index("item_id")

@@ -19,7 +19,7 @@ MECHANISM = ("probe_items", "hidden_states", "probes", "directions", "cosines", 
 MECHANISM += ("steering_effects", "steering_shares", "steering_nulls", "steering_pecs")
 MECHANISM += ("probe_baselines", "gate", "risk_coverage", "lens", "item_scores", "sentences", "patching")
 PEOPLE = ("human_labels", "human_agreement", "human_row", "panel_errors", "corrected")  # nobody has labelled
-ON_REQUEST = ("arms", "hypotheses", "robust")  # an experiment names arms and variations
+ON_REQUEST = ("arms", "graded", "hypotheses", "robust")  # an experiment names arms and variations
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
 
 

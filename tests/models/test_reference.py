@@ -9,12 +9,15 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, uniform
+from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, believed, uniform
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Request, TransientError
 from traps_pipeline.protocol.regimes import FIELDS
 
 LABELS = ["left", "right", "elsewhere"]
+
+
+BAYES = ("bayes", "bayes-cautious", "bayes-rash")
 
 
 def request(side: str, item: int = 0, regime: str = "standard", **params: Any) -> Request:
@@ -47,6 +50,27 @@ def test_an_abstention_rate_holds_on_both_sides_within_three_sigma(model: str, r
     for side in ("control", "void"):
         count = sum(STRATEGIES["abstain-at-rate"](request(side, k, **params)) is None for k in range(n))
         assert abs(count - n * rate) <= 3 * (n * rate * (1 - rate)) ** 0.5  # 67 of 1,000; 54 of 400
+
+
+def test_bayes_answers_what_is_probable_enough_and_states_what_it_believes() -> None:
+    asked = request("control", regime="probabilities", **get_model("bayes").params)
+    asked = replace(asked, secret={**asked.secret, "posterior": {"left": 0.8, "elsewhere": 0.2}})
+    text = json.loads(str(asyncio.run(ReferenceBackend().ask(asked)).text))
+    assert {one["answer"]: one["probability"] for one in text["probabilities"]} == {
+        "left": 0.8, "right": 0.0, "elsewhere": 0.2
+    }  # fmt: skip
+    said = {name: STRATEGIES["bayes"](replace(asked, params=get_model(name).params)) for name in BAYES}
+    assert said == {"bayes": "left", "bayes-cautious": None, "bayes-rash": "left"}
+    noisy = get_model("bayes-noisy").params
+    shares = [believed(replace(request("control", k), secret=asked.secret, params=noisy))["left"] for k in range(200)]
+    assert min(shares) < 0.5 < 0.75 < max(shares)
+
+
+@pytest.mark.parametrize("model", ["bayes", "bayes-cautious"])
+def test_without_futures_bayes_is_the_oracle(model: str) -> None:
+    params = get_model(model).params
+    assert STRATEGIES["bayes"](request("control", **params)) == "right"
+    assert STRATEGIES["bayes"](request("void", **params)) is None
 
 
 def test_what_looks_random_is_the_same_every_time_and_differs_between_seeds() -> None:

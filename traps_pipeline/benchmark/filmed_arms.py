@@ -21,9 +21,10 @@ from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import CROSSED, beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import CROSSED, GRADED, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
+from traps_pipeline.scenes.variants.graded import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -32,7 +33,7 @@ from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS, A
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
-KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, **VARIATIONS}
+KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, GRADED: GRADED_CUT, **VARIATIONS}
 SECONDS_AN_ARM = 2.0  # of one core, in the mean: one is a clip, or two questions, or a proof that it is refused
 _FOUND = ".arm.json"  # how the files end that say what came of an arm
 
@@ -160,8 +161,8 @@ def _files(clip: Path) -> tuple[Path, ...]:
 @cache
 def _code(arm: str) -> str:
     """Return the code that films an arm or a variation: after a change of it, it is filmed anew."""
-    name = "arms.py" if arm in ARM_NAMES else "variations.py"
-    return file_digest(PACKAGE / "scenes" / "variants" / name)
+    name = GRADED if arm == GRADED else "arms" if arm in ARM_NAMES else "variations"
+    return file_digest(PACKAGE / "scenes" / "variants" / f"{name}.py")
 
 
 def arm_of(spec: SceneSpec, arm: str) -> Arm:

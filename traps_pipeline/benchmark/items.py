@@ -5,14 +5,22 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
-from traps_pipeline.protocol.datasets import ALL_CATEGORIES, BESIDE, CROSSED, SIDES, all_datasets_of, is_ill_posed
+from traps_pipeline.protocol.datasets import (
+    ALL_CATEGORIES,
+    BESIDE,
+    CROSSED,
+    GRADED,
+    SIDES,
+    all_datasets_of,
+    is_ill_posed,
+)
 from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
@@ -103,7 +111,10 @@ def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: 
         control_answer=row["ground_truth"] or spec["ground_truth"],
         media_digest=row["media_digest"],
     )
-    return _row(decisive, spec, commonest, row["clip"], version)
+    item = _row(decisive, spec, commonest, row["clip"], version)
+    if row["arm"] == GRADED:  # its score depends on how probable each answer is
+        return replace(item, item_hash=digest([item.item_hash, json.loads(row["evidence"])["posterior"]]))
+    return item
 
 
 def answer_type_of(labels: Sequence[str]) -> str:

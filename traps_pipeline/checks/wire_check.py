@@ -38,7 +38,7 @@ from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.regimes import BY_NAME, REGIMES
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, sample
 from traps_pipeline.video.encode import encode
 
@@ -223,8 +223,8 @@ def _examine_network(entry: Entry) -> Checked:
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
     """Yield departures from the protocol, which holds for every model in addition to its entry."""
     for regime, request in requests.items():
-        if ("response_format" in request.params) != (entry.json_schema and regime == "json"):
-            yield f"{regime}: structured output is for the JSON regime alone, where the entry has json_schema"
+        if ("response_format" in request.params) != (entry.json_schema and bool(BY_NAME[regime].fields)):
+            yield f"{regime}: structured output is for regimes that ask for an object, where the entry has json_schema"
     frame_counts = {request.sent.n_frames for request in requests.values() if request.sent}
     if "media" not in entry.waivers and frame_counts != {_PROTOCOL_FRAMES}:
         yield f"media: {frame_counts} frames of a 5 s clip are sent, the protocol has {_PROTOCOL_FRAMES} (5 a second)"

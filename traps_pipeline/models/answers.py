@@ -12,6 +12,7 @@ from typing import Any
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.posteriors import posteriors
 from traps_pipeline.models.answer_rows import ResponseRow
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.framing import framed
@@ -21,7 +22,7 @@ from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.protocol.datasets import dataset_of
+from traps_pipeline.protocol.datasets import GRADED, dataset_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import StageOutput
@@ -97,16 +98,29 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     cell of 100,000 items may have a hundred questions."""
     copies: dict[str, str] = {}
     rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
-    return [
-        {name: copies.setdefault(value, value) if isinstance(value, str) else value for name, value in row.items()}
-        for row in rows
-    ]
+    return with_posteriors(
+        workspace,
+        dataset,
+        [
+            {name: copies.setdefault(value, value) if isinstance(value, str) else value for name, value in row.items()}
+            for row in rows
+        ],
+    )
+
+
+def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return items of a dataset; of graded cuts with `posterior`, which the strategy `bayes` knows."""
+    if dataset != GRADED:
+        return items
+    known = posteriors(workspace)
+    return [item | {"posterior": known[item["pair_id"].removeprefix(f"{GRADED}:")]} for item in items]
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
     """Return what reference strategies may read: side, labels, on a control its ground truth; the sub-scenario's
     commonest answer goes to `prior` and to the rules alone, so that a corrected answer which changes it re-asks no
-    other model. A rule reads nothing else, and every other model nothing at all."""
+    other model, and how probable answers are to `bayes` alone. A rule reads nothing else, and every other model nothing
+    at all."""
     if entry.backend == "rule":
         return {"commonest_answer": item["commonest_answer"]}
     if entry.backend != "reference":
@@ -116,6 +130,8 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
         secret["ground_truth"] = item["ground_truth"]
     if entry.params["strategy"] == "prior":
         secret["commonest_answer"] = item["commonest_answer"]
+    if entry.params["strategy"] == "bayes" and "posterior" in item:
+        secret["posterior"] = item["posterior"]
     return secret
 
 

@@ -10,6 +10,8 @@ import asyncio
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
+from math import exp
+from statistics import NormalDist
 from typing import Any
 
 from traps_pipeline.base.digests import digest
@@ -18,6 +20,8 @@ from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.protocol.regimes import fields_of
 
 ABSTENTION = "I don't know"
+_DOUBT = 0.01  # what `bayes` with noise adds to each probability, so that it can be wrong where one is 1
+_TINY = 1e-12
 Strategy = Callable[[Request], str | None]  # the label answered, None for an abstention
 
 
@@ -44,6 +48,26 @@ def _sometimes(parameter: str) -> Strategy:
     return strategy
 
 
+def believed(request: Request) -> dict[str, float]:
+    """Return how probable `bayes` takes each answer to be: as the futures of a graded cut say, else as the oracle knows
+    (nothing of a void). noise: the standard deviation of what is wrong with the logarithms of its probabilities."""
+    secret, noise = request.secret, request.params["noise"]
+    truth, even = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
+    known = secret.get("posterior") or (truth if secret["side"] == "control" else even)
+    weights = dict[str, float]()
+    for label in secret["labels"]:
+        off = NormalDist().inv_cdf(uniform(request, f"noise {label}") or _TINY) if noise else 0.0
+        weights[label] = (known.get(label, 0.0) + (_DOUBT if noise else 0.0)) * exp(noise * off)
+    return {label: weight / sum(weights.values()) for label, weight in weights.items()}
+
+
+def _bayes(request: Request) -> str | None:
+    """Return the answer that is most probably right, if it is so with the probability `answers_from`."""
+    belief = believed(request)
+    best = max(belief, key=lambda label: belief[label])
+    return best if belief[best] >= request.params["answers_from"] else None
+
+
 STRATEGIES: Mapping[str, Strategy] = {
     "oracle": lambda r: r.secret["ground_truth"] if r.secret["side"] == "control" else None,
     "always-abstain": lambda r: None,
@@ -52,6 +76,7 @@ STRATEGIES: Mapping[str, Strategy] = {
     "inverse-oracle": lambda r: None if r.secret["side"] == "control" else _truth(r),
     "abstain-at-rate": _sometimes("abstain_probability"),
     "prior": lambda r: r.secret["commonest_answer"],
+    "bayes": _bayes,
 }
 
 
@@ -63,8 +88,15 @@ def phrase(answer: str | None, request: Request) -> str:
         reason, final = "I followed the motion to the end of the clip.", answer
     if fields := fields_of(str(request.about["regime"]), dataset_of(str(request.about["item_id"]))):
         answer_object = {"reason": reason, "abstain": answer is None, "final_answer": final}
-        return json.dumps({name: answer_object[name] for name in fields})
+        return json.dumps({name: (answer_object | _stated(answer, request))[name] for name in fields})
     return f"{reason} {ABSTENTION}." if answer is None else f"{reason} The answer is: {final}."
+
+
+def _stated(answer: str | None, request: Request) -> dict[str, Any]:
+    """Return the probabilities that go with an answer: those of `bayes`; else all for the answer, and of an abstention
+    none, which leaves all answers alike."""
+    belief = believed(request) if request.params.get("strategy") == "bayes" else {answer: 1.0} if answer else {}
+    return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in belief.items()]}
 
 
 class ReferenceBackend:

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 
 def structured(name: str, **properties: Any) -> dict[str, Any]:
     """Return the `response_format` of an object with exactly these properties (JSON schema of each), all of them
     required."""
-    schema = {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
-    return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": schema}}
+    return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": _object(**properties)}}
 
 
-_TYPES = {"reason": "string", "abstain": "boolean", "final_answer": "string"}
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
+
+
+_TYPES: Mapping[str, Any] = {
+    "reason": {"type": "string"},
+    "abstain": {"type": "boolean"},
+    "final_answer": {"type": "string"},
+    "probabilities": {"type": "array", "items": _object(answer={"type": "string"}, probability={"type": "number"})},
+}
 
 
 def answer_object(fields: Iterable[str]) -> dict[str, Any]:
     """Return the `response_format` of an answer with these fields (`regimes.FIELDS`)."""
-    return structured("answer", **{name: {"type": _TYPES[name]} for name in fields})
+    return structured("answer", **{name: _TYPES[name] for name in fields})

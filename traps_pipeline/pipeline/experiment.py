@@ -17,7 +17,7 @@ from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SCHEMAS
-from traps_pipeline.protocol.regimes import PAPER_REGIMES, REGIMES
+from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 
 EXPERIMENTS = ASSETS / "experiments"
@@ -89,10 +89,11 @@ class Experiment(BaseModel):
     @model_validator(mode="after")
     def _one_object_is_asked_for(self) -> Experiment:
         schemas = [dataset for dataset in self.datasets if dataset in SCHEMAS]
-        if schemas and "json" in self.regimes:
+        objects = [regime for regime in self.regimes if BY_NAME[regime].fields]
+        if schemas and objects:
             raise ValueError(
-                f"datasets {', '.join(schemas)} ask for an object of their own, and so does the regime json: leave one "
-                "of them out"
+                f"datasets {', '.join(schemas)} ask for an object of their own, and so does the regime {objects[0]}: "
+                "leave one of them out"
             )
         return self
 

@@ -10,7 +10,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.answers import answer_request, with_posteriors
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
@@ -99,7 +99,8 @@ def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str,
     if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
         return None
     items = workspace.tables.records(ITEMS, {"dataset": dataset})
-    return next((item for item in items if item["item_id"] == item_id), None)
+    named = [item for item in items if item["item_id"] == item_id]
+    return next(iter(with_posteriors(workspace, dataset, named)), None)
 
 
 def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:

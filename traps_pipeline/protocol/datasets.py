@@ -28,6 +28,9 @@ TWIN = "twin_control"
 INFERENCE_ARMS = ("late_panel", "predictable_cut")  # the outcome is not shown, but can be inferred
 ROBUST_ARMS = ("decoy", "removed", "length_matched", TWIN, CROSSED)
 ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
+# Controls cut where their futures leave one answer as likely as is stated (docs/arms.md, "Graded cuts"). In no figure
+# of pairs or arms; asked on request.
+GRADED = "graded"
 # Datasets that change one thing of the pairs, step by step, for what the paper supposes and did not measure
 # (docs/hypotheses.md). No part of PECS or of the arms' figures; asked on request.
 LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
@@ -36,10 +39,10 @@ PANEL_DOSES = ("panel_alpha_50",)  # the panel lets the outcome through: no void
 SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
 FRAMINGS = ("frames_later", "frames_few", "frames_all")
 VARIATIONS = (*LABEL_DOSES, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
-BESIDE = (*ARMS, *VARIATIONS)  # all that is no dataset of the pairs
+BESIDE = (*ARMS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
     **dict.fromkeys(("decoy", "removed", "late_panel", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
-    **dict.fromkeys(("length_matched", "predictable_cut"), "chaotic"),
+    **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
 }
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
 TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each side's frames with the other's times
@@ -100,5 +103,5 @@ def dataset_of(item_id: str) -> str:
 
 def sides_of(dataset: str) -> tuple[str, ...]:
     """Return the sides that a dataset, an arm or a variation asks of each scenario."""
-    controls = {*ARMS, *PANEL_DOSES} - {CROSSED}
+    controls = {*ARMS, GRADED, *PANEL_DOSES} - {CROSSED}
     return ("control",) if dataset in controls else ("void",) if dataset in PANEL_LOOKS else SIDES

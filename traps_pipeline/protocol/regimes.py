@@ -29,6 +29,12 @@ BY_NAME: Mapping[str, Regime] = {
         Regime("standard", ("standard",), states=("vqa_standard",), marker="hollow"),
         Regime("guided", ("standard", "guided_suffix"), states=("vqa_standard", "vqa_guided_suffix"), marker="filled"),
         Regime("json", ("standard", "json_suffix"), fields=("reason", "final_answer")),
+        Regime("priced", ("standard", "priced_suffix")),
+        Regime(
+            "probabilities",
+            ("standard", "probabilities_suffix"),
+            fields=("reason", "probabilities", "final_answer"),
+        ),
     )
 }
 # The fields of the object that an answer must be, by what asks for it; any other answer is free text.
@@ -38,6 +44,9 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
     "schema_reason": ("reason", "final_answer"),
     "schema_abstain": ("reason", "abstain", "final_answer"),
 }
+# What `priced_suffix.txt` states: a right answer earns 1 point, a wrong one costs these, an abstention earns nothing.
+WRONG_COSTS = 3
+ANSWER_FROM = WRONG_COSTS / (1 + WRONG_COSTS)  # the probability of being right from which an answer is worth its risk
 REGIMES = tuple(BY_NAME)
 PAPER_REGIMES = ("standard", "guided", "json")  # what the paper asks, and an experiment that names no regimes
 VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)

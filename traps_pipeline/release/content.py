@@ -18,7 +18,7 @@ from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
-from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.release.released_rows import (
     CertificateRow,
     HeldOutItemRow,
@@ -203,7 +203,7 @@ def prompt_rows(canary: str) -> list[PromptRow]:
     """Return a row for the system prompt of each regime, and for each of the panel's tasks."""
     texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
     texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
-    texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}
+    texts |= {(SYSTEM, regime): system_prompt(regime) for regime in PAPER_REGIMES}
     return [
         PromptRow(name=name, role=role, text=text, version=digest(text)[:16], licence=PROMPT_LICENCE, canary=canary)
         for (role, name), text in sorted(texts.items())

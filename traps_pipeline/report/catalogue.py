@@ -11,12 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
 from traps_pipeline.report import findings, printed_tables
-from traps_pipeline.report.figures import abstention, expression_figures, grids, landscape, steering_figures
+from traps_pipeline.report.figures import (
+    abstention,
+    expression_figures,
+    graded_figure,
+    grids,
+    landscape,
+    steering_figures,
+)
 from traps_pipeline.report.figures import control_figures as figures_of_inside
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables import (
     comparisons,
     control_reports,
+    graded_tables,
     human_tables,
     hypothesis_tables,
     judge_tables,
@@ -38,8 +46,9 @@ RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the pape
 # Stages whose tables hold figures that the panel decided: what reads one of them says who judged. Tests hold this
 # against the graph.
 JUDGED_STAGES = {
-    *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "leave_one_out", "item_scores", "corrected"),
-    *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs", "gate", "risk_coverage"),
+    *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "graded", "leave_one_out"),
+    *("item_scores", "corrected", "gate", "risk_coverage"),
+    *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs"),
 }
 
 
@@ -158,6 +167,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("chaotic_sub_scenarios", sub_scenarios.chaotic_sub_scenarios, ("metrics", "items"),
         printed_tables.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
     TableReport("hypotheses", hypothesis_tables.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
+    TableReport("graded", graded_tables.graded, ("graded",)),
     TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_tables.agreement),
     TableReport("judge_bias", judge_tables.judge_bias, ("judge_bias", "leave_one_out")),
     TableReport("confabulation", judge_tables.confabulation, ("confabulation_prevalence",),
@@ -191,6 +201,7 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("doubt_conversion", "Doubt and conversion", abstention.doubt,
         ("leaderboard", "confabulation_prevalence")),
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", grids.sub_scenarios, ("metrics", "items")),
+    FigureReport("graded", "Graded cuts", graded_figure.graded, ("graded",), published=False),
     FigureReport("confabulation", "Prevalence of confabulation", grids.confabulation, ("confabulation_prevalence",)),
     FigureReport("states_and_output", "States against output, item by item", expression_figures.states_and_output,
         ("item_scores", "sentences", "probe_baselines"), published=False, finding=findings.states_and_output),

@@ -31,6 +31,7 @@ from traps_pipeline.protocol.regimes import PROBE_PROMPT
 from traps_pipeline.scoring.score_rows import (
     CONFABULATION_PREVALENCE,
     CONTRASTS,
+    GRADED_CUTS,
     HYPOTHESES,
     LEADERBOARD,
     LEAVE_ONE_OUT,
@@ -119,6 +120,7 @@ class Results:
     leave_one_out = LazyFrame(table=LEAVE_ONE_OUT)
     robust = LazyFrame(table=ROBUST)
     hypotheses = LazyFrame(table=HYPOTHESES)
+    graded = LazyFrame(table=GRADED_CUTS)
     contrasts = LazyFrame(table=CONTRASTS)
     regime_tests = LazyFrame(table=REGIME_TESTS)
     confabulation = LazyFrame(table=CONFABULATION_PREVALENCE)

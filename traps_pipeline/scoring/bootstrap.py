@@ -215,6 +215,17 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
         return np.stack([yes, yes + unseen]) / (decided + unseen)
 
 
+def ends_of_mean(values: pd.Series, drawn: Drawn, named: str) -> np.ndarray:
+    """Return the ends of the mean of values in [0, 1], one for each scenario of the index, (2, 1 + resamples). named:
+    as in `run_sums`."""
+    sums = np.zeros((1, 2, 1 + drawn.resamples))
+    for scenarios, weights in drawn.scenarios.values():
+        own = values.reindex(scenarios)
+        counts = np.stack([own.fillna(0.0), own.notna()], axis=1).astype(float)
+        sums += resampled_sums(weights, counts[:, None])
+    return shares_of(with_unseen(sums, np.array([[len(values)]]), drawn.unseen(named, 1)))[:, 0, 0]
+
+
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
     """Return RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples), as
     `shares_of`.

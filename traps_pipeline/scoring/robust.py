@@ -29,13 +29,11 @@ from traps_pipeline.scoring.bootstrap import (
     Drawn,
     difference,
     draw_scenarios,
+    ends_of_mean,
     ends_of_pecs,
     figures_of,
-    resampled_sums,
     run_sums,
-    shares_of,
     with_interval,
-    with_unseen,
 )
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import ROBUST
@@ -166,13 +164,7 @@ def _conjunction(items: pd.DataFrame, drawn: Drawn, named: str) -> tuple[np.ndar
     """Return the ends of the share of decided scenarios that `conjunction_of` finds right, (2, draws), and their
     number."""
     decided = conjunction_of(items).dropna()
-    sums = np.zeros((1, 2, 1 + drawn.resamples))
-    for scenarios, weights in drawn.scenarios.values():
-        own = decided.reindex(scenarios)
-        counts = np.stack([own.fillna(0.0), own.notna()], axis=1).astype(float)
-        sums += resampled_sums(weights, counts[:, None])
-    ends = shares_of(with_unseen(sums, np.array([[len(decided)]]), drawn.unseen(named, 1)))
-    return ends[:, 0, 0], len(decided)
+    return ends_of_mean(decided, drawn, named), len(decided)
 
 
 def _missing(items: pd.DataFrame) -> int:

@@ -260,6 +260,45 @@ HYPOTHESES = Table("hypotheses", HypothesisRow, partition_by=(), key=("model", "
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
+class GradedRow:
+    """A model under a regime on graded cuts, all of them or those of one range (docs/scoring.md, "Graded cuts").
+
+    All figures are what is expected by the posterior, the distribution over answers that the futures of a cut have.
+    """
+
+    model: shared.Model
+    regime: shared.Regime
+    scope: Annotated[str, "all, or the range of the commonest answer's probability, such as 0.6 to 0.75"]
+    n_runs: Annotated[int, "runs averaged"]
+    n_items: Annotated[int, "items with a decision in some run: what all figures are of"]
+    n_missing: Annotated[int, "items without a decision, over runs: no answer, no majority, no readable probabilities"]
+    top: Annotated[float | None, "mean probability of the commonest answer"]
+    coverage: Annotated[float | None, "share answered; of stated probabilities, where the largest is worth its risk"]
+    risk: Annotated[float | None, "expected share of wrong answers among those"]
+    points: Annotated[float | None, "expected a question: 1 for right, -3 for wrong, 0 for abstaining", CI]
+    regret: Annotated[float | None, "what an ideal observer earns more, the sum of the next three", CI]
+    regret_label: Annotated[float | None, "because another answer was given than the commonest"]
+    regret_rash: Annotated[float | None, "because an answer was given where abstaining earns more"]
+    regret_shy: Annotated[float | None, "because of abstaining where an answer earns more"]
+    abstains_right: Annotated[float | None, "share abstained on where abstaining earns more"]
+    abstains_wrong: Annotated[float | None, "share abstained on where an answer earns more"]
+    stated: Annotated[float | None, "mean probability stated for the commonest answer; null where none is asked for"]
+    brier: Annotated[float | None, "expected Brier score of stated probabilities, from 0 to 2", CI]
+    brier_ideal: Annotated[float, "that of the posterior itself"]
+    brier_even: Annotated[float, "that of equal probabilities"]
+    points_ideal: Annotated[float, "what an ideal observer earns"]
+    points_best: Annotated[float, "what the commonest answer earns if it is always given"]
+    points_prior: Annotated[float, "what the sub-scenario's commonest answer earns if it is always given"]
+    panel: shared.Panels
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+GRADED_CUTS = Table("graded", GradedRow, partition_by=(), key=("model", "regime", "scope"))
+
+
+@dataclass(frozen=True, kw_only=True)
 class LeaveOneOutRow:
     """A model under a regime on one dataset, or overall, scored by the other two judges; 1-1 is undecided."""
 

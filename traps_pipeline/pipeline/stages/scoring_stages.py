@@ -1,20 +1,29 @@
 """The scoring group: metrics of cells, contrasts, the leaderboard."""
 
+import json
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.judging_rows import VERDICTS
+from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Markdown, rows_shown
 from traps_pipeline.pipeline.schemes import DATASET, by_dataset
-from traps_pipeline.pipeline.stage import of, stage
-from traps_pipeline.pipeline.stages.benchmark_stages import items
-from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
-from traps_pipeline.protocol.datasets import ARMS, DATASETS
-from traps_pipeline.scoring.score_rows import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
+from traps_pipeline.pipeline.stage import is_declared, of, stage
+from traps_pipeline.pipeline.stages.benchmark_stages import arms, items
+from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts, votes
+from traps_pipeline.protocol.datasets import ARMS, DATASETS, GRADED
+from traps_pipeline.scoring.score_rows import (
+    CONTRASTS,
+    GRADED_CUTS,
+    HYPOTHESES,
+    LEADERBOARD,
+    METRICS,
+    REGIME_TESTS,
+    ROBUST,
+)
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
@@ -158,3 +167,41 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     rows = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
     offered = {str(id_): len(labels) for id_, labels in zip(rows["item_id"], rows["labels"], strict=True)}
     return by_dose(judged, offered)
+
+
+@_stage(
+    GRADED_CUTS,
+    parents=[
+        *([of(arms, need="none")] if is_declared("arms") else []),
+        *(of(parent, need="some") for parent in (items, responses, votes, verdicts)),
+        judges,
+    ],
+    checks=[
+        Check(
+            "graded_rows_hold",
+            "Figures lie in their limits and intervals; regret is the sum of its parts, and what the ideal earns more.",
+            _none_of("graded.wrong_rows", "rows"),
+        )
+    ],
+)
+def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
+    """Return what every model and regime earns on graded cuts, against the true distribution over answers; empty if
+    none was asked."""
+    from traps_pipeline.benchmark.posteriors import posteriors
+    from traps_pipeline.models.answer_rows import RESPONSES
+    from traps_pipeline.scoring.graded import Asked
+    from traps_pipeline.scoring.graded import graded as against_posterior
+
+    known = posteriors(workspace)
+    asked = {
+        row["item_id"]: Asked(
+            [*row["labels"]],
+            json.loads(row["aliases"]),
+            row["answer_type"],
+            row["commonest_answer"],
+            known[row["scenario_id"]],
+        )
+        for row in workspace.tables.read_all(ITEMS, dataset=GRADED).to_dict("records")
+    }
+    parts = (current_rows(workspace, table, dataset=GRADED) for table in (VERDICTS, VOTES, RESPONSES))
+    return against_posterior(*parts, asked)

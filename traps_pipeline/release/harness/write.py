@@ -18,7 +18,7 @@ from traps_pipeline.models.judges import RULES_PANEL, panel_id
 from traps_pipeline.models.registry import PROTOCOL
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
-from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
@@ -160,7 +160,7 @@ def _lmms(target: Path, about: Mapping[str, Any]) -> None:
     write_text(target / LMMS / "utils.py", copied((_CODE / "release/harness/lmms_utils.py").read_text("utf-8")))
     parameters = {"max_new_tokens": about["parameters"]["max_tokens"], "do_sample": True}
     parameters |= {name: about["parameters"][name] for name in ("temperature", "top_p")}
-    for regime in REGIMES:
+    for regime in PAPER_REGIMES:
         task = {
             "task": f"traps_{regime}",
             "dataset_path": "json",

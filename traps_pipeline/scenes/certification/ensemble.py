@@ -100,7 +100,7 @@ class Futures:
         self._control, self._seed = control, seed
         self._alike_px, self._held = alike_px, round(held_s * control.physics.fps)
         self._rollouts: list[Rollout] = []
-        self._after: dict[int, Counter[str | None]] = {}
+        self._after: dict[tuple[int, int, int], Counter[str | None]] = {}
 
     def batches(self) -> Iterator[list[Rollout]]:
         """Yield all rollouts so far after each batch of `BATCHES`."""
@@ -124,14 +124,15 @@ class Futures:
         known = self._rollouts[number] if number < len(self._rollouts) else None
         return self._roll(number, whole=True) if known is None or known.qpos is None else known
 
-    def after(self, cut: int) -> Counter[str | None]:
+    def after(self, cut: int, count: int = AT_CUT, *, beyond: int = 0) -> Counter[str | None]:
         """Return how often the futures of the state in the last frame before a cut end in which outcome (None:
-        undecided): of AT_CUT states that differ from it by what no viewer resolves (UNSEEN_PX, READ_OVER_S)."""
-        if cut not in self._after:
-            self._after[cut] = self._simulated_after(cut)
-        return self._after[cut]
+        undecided): of so many states that differ from it by what no viewer resolves (UNSEEN_PX, READ_OVER_S). Each
+        count has states of its own. beyond: frames after the clip in which what is undecided at its end may settle."""
+        if (cut, count, beyond) not in self._after:
+            self._after[cut, count, beyond] = self._simulated_after(cut, count, beyond)
+        return self._after[cut, count, beyond]
 
-    def _simulated_after(self, cut: int) -> Counter[str | None]:
+    def _simulated_after(self, cut: int, count: int, beyond: int) -> Counter[str | None]:
         import mujoco
 
         model, control = self._prepared.model, self._control
@@ -141,7 +142,7 @@ class Futures:
             if i:
                 mujoco.mj_step(model, state, control.physics.substeps)
             past[i] = state.qpos
-        steps = np.random.default_rng([self._seed, AT_CUT, cut]).normal(size=(AT_CUT, 2, model.nv))
+        steps = np.random.default_rng([self._seed, count, cut]).normal(size=(count, 2, model.nv))
         unseen = unseen_steps(model, state, control.camera)
 
         def label(step: np.ndarray) -> str | None:
@@ -151,12 +152,15 @@ class Futures:
             mujoco.mj_integratePos(model, moved, along_contacts(model, state, step[0] * unseen), 1.0)
             data.qpos[:] = moved
             data.qvel += step[1] * unseen * math.sqrt(2) / READ_OVER_S
-            frames = np.empty((len(control.qpos), model.nq))
-            frames[:cut] = past
-            for i in range(cut, len(frames)):
-                mujoco.mj_step(model, data, control.physics.substeps)
-                frames[i] = data.qpos
-            return self._settled(frames) if np.isfinite(frames).all() else None
+            frames, settled = past, None
+            for more in (len(control.qpos) - cut, beyond):
+                if settled is None and more:
+                    frames = np.concatenate([frames, np.empty((more, model.nq))])
+                    for i in range(len(frames) - more, len(frames)):
+                        mujoco.mj_step(model, data, control.physics.substeps)
+                        frames[i] = data.qpos
+                    settled = self._settled(frames) if np.isfinite(frames).all() else None
+            return settled
 
         with ThreadPoolExecutor(THREADS) as pool:
             return Counter(pool.map(label, steps))

@@ -1,0 +1,19 @@
+"""How probable each answer to a graded cut is, as its arm measured it (docs/arms.md, "Graded cuts")."""
+
+from __future__ import annotations
+
+import json
+
+from traps_pipeline.protocol.datasets import GRADED
+from traps_pipeline.storage.benchmark_tables import ARMS
+from traps_pipeline.storage.workspace import Workspace
+
+
+def posteriors(workspace: Workspace) -> dict[str, dict[str, float]]:
+    """Return the probability of each answer that any future ends in, by scenario; of those that have a graded cut."""
+    rows = workspace.tables.read_all(ARMS, ["scenario_id", "arm", "refused", "evidence"])
+    rows = rows.loc[rows["arm"].eq(GRADED) & rows["refused"].isna()]
+    return {
+        scenario: json.loads(evidence)["posterior"]
+        for scenario, evidence in zip(rows["scenario_id"], rows["evidence"], strict=True)
+    }

@@ -1,0 +1,57 @@
+"""What models earn on graded cuts, beside an ideal observer and strategies that know nothing of a clip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
+from traps_pipeline.report.result_frames import Results
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, ordered
+from traps_pipeline.report.writing import NONE, Column, PrintedTable, fraction
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WHY = "graded cuts were not asked (name `graded` under datasets)"
+
+
+def graded(results: Results) -> list[PrintedTable]:
+    """Return what each model is expected to earn on cuts whose answers have known probabilities, and what it loses by
+    not knowing them, by answering too often and by abstaining too often."""
+    rows = results.graded
+    rows = rows.loc[rows["scope"] == "all"]
+    shown = {f"{name}_shown": [_figure(row, name) for row in rows.to_dict("records")] for name in ("points", "brier")}
+    rows = ordered(rows.assign(**shown), ["regime", "model"])
+    columns = [
+        MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
+        Column("coverage", "Answers %", "percent"), Column("risk", "Wrong %", "percent"),
+        Column("points_shown", "Points", "range"),
+        Column("regret", "Regret", "fraction", 2, group=True), Column("regret_label", "by answer", "fraction", 2),
+        Column("regret_rash", "rash", "fraction", 2), Column("regret_shy", "shy", "fraction", 2),
+        Column("abstains_right", "Abstains rightly %", "percent", group=True),
+        Column("abstains_wrong", "wrongly %", "percent"),
+        Column("brier_shown", "Brier", "range", group=True),
+    ]  # fmt: skip
+    return [PrintedTable("graded", "Graded cuts", rows, columns, _notes(rows) if len(rows) else [], WHY)]
+
+
+def _notes(rows: pd.DataFrame) -> list[str]:
+    most = rows.loc[rows["n_items"].idxmax()]
+    figures = {name: fraction(most[name], 2) for name in most.index if name.startswith(("points_", "brier_"))}
+    return [
+        f"points a question: 1 for a right answer, -{WRONG_COSTS} for a wrong one, 0 for an abstention, as expected by "
+        f"the cut's posterior; from a probability of {ANSWER_FROM:g} on an answer is worth its risk",
+        f"an ideal observer earns {figures['points_ideal']}; always abstaining earns 0; always the likeliest answer "
+        f"{figures['points_best']}; always the family's commonest answer {figures['points_prior']}",
+        "regret: points that the ideal observer earns more: with the likeliest answer, without answers that are not "
+        "worth their risk (rash), with those that are (shy)",
+        f"Brier: of stated probabilities, from 0 to 2; the posterior has {figures['brier_ideal']}, equal probabilities "
+        f"{figures['brier_even']}; points are then those of who acts on them",
+        "brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen; no part of any other figure",
+    ]
+
+
+def _figure(row: Mapping[Any, Any], name: str) -> str:
+    own, low, high = (fraction(row[column], 2) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
+    return own if NONE in (own, low) else f"{own} [{low}, {high}]"

@@ -1,0 +1,211 @@
+"""Answers to graded cuts against the true distribution over answers (docs/scoring.md, "Graded cuts").
+
+A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns nothing. What an answer is expected to
+earn follows from the posterior of its cut, so no figure here depends on which of the futures was filmed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.judging.judged_answers import is_correct, read_object, to_label
+from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS, fields_of
+from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Drawn, draw_scenarios, ends_of_mean, with_interval
+from traps_pipeline.scoring.metrics import joined_epochs, joined_versions
+from traps_pipeline.scoring.score_rows import GRADED_CUTS
+
+SCOPES = (0.0, 0.45, 0.6, ANSWER_FROM, 0.9)  # where ranges of the commonest answer's probability begin
+SUM_WITHIN = 0.05  # of 1, or stated probabilities are unread
+WITH_INTERVAL = {"points": (-WRONG_COSTS, 1.0), "regret": (0.0, 1.0 + WRONG_COSTS), "brier": (0.0, 2.0)}  # their limits
+PARTS = ("regret_label", "regret_rash", "regret_shy")
+_ANSWER = ["item_id", "model", "regime", "run"]
+_MEANS = ("top", *PARTS, "abstains_right", "abstains_wrong", "stated", "brier_ideal", "brier_even")
+_MEANS += ("points_ideal", "points_best", "points_prior")
+_FIGURES = ["answers", "wrong", *WITH_INTERVAL, *_MEANS]
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A graded item. posterior: the probability of each answer that any future ends in. commonest: the sub-scenario's
+    commonest answer."""
+
+    labels: Sequence[str]
+    aliases: Mapping[str, str]
+    answer_type: str
+    commonest: str
+    posterior: Mapping[str, float]
+
+    def label_of(self, value: str | None) -> str | None:
+        """Return the answer that a value names, as code decides correctness; None if it names none."""
+        of = self.answer_type, self.labels, self.aliases
+        return next((label for label in self.labels if is_correct(value, label, *of)), None)
+
+    def read_probabilities(self, text: str | None) -> dict[str, float] | None:
+        """Return the probability that a text states for each answer: those of its object's `probabilities`, and what
+        is left to 1 evenly for the answers that it does not name. None if it states none, one twice, or a sum off 1."""
+        entries = (read_object(text or "") or {}).get("probabilities")
+        stated = dict[str, float]()
+        for entry in entries if isinstance(entries, list) else [None]:
+            if not isinstance(entry, dict):
+                return None
+            label, number = to_label(str(entry.get("answer")), self.labels, self.aliases), entry.get("probability")
+            is_number = isinstance(number, int | float) and not isinstance(number, bool)
+            if label is None or label in stated or not (is_number and 0 <= number <= 1):
+                return None
+            stated[label] = number
+        others = [label for label in self.labels if label not in stated]
+        left = 1 - sum(stated.values())
+        if left < -SUM_WITHIN or (left > SUM_WITHIN and not others):
+            return None
+        stated |= dict.fromkeys(others, max(0.0, left) / max(1, len(others)))
+        return {label: stated[label] / sum(stated.values()) for label in self.labels}
+
+
+def graded(
+    verdicts: pd.DataFrame,
+    votes: pd.DataFrame,
+    responses: pd.DataFrame,
+    asked: Mapping[str, Asked],
+    resamples: int = RESAMPLES,
+    seed: int = SEED,
+) -> pd.DataFrame:
+    """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, which are given by id."""
+    labels, texts = _labels(votes, asked), responses.set_index(_ANSWER)["text"].to_dict()
+    rows = []
+    for verdict in verdicts.to_dict("records"):
+        key, item = tuple(verdict[name] for name in _ANSWER), asked[verdict["item_id"]]
+        if "probabilities" in (fields_of(verdict["regime"]) or ()):
+            figures = _of_probabilities(item, item.read_probabilities(texts.get(key)))
+        else:
+            figures = _of_verdict(item, verdict["abstained"], labels.get(key))
+        rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **figures})
+    if not rows:
+        return pd.DataFrame(columns=pd.Index(GRADED_CUTS.names))
+    items = pd.DataFrame(rows).reindex(columns=[*verdicts.columns, "taxonomy", *_FIGURES])
+    drawn, table = draw_scenarios(items, resamples, seed), []
+    starts = np.searchsorted(SCOPES, items["top"] + _ROUNDING, side="right") - 1
+    for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
+        scopes = [("all", group), *((_name(k), part) for k, part in group.groupby(starts[group.index]))]
+        table += [
+            {"model": model, "regime": regime, "scope": scope, **_row(part, f"{model}|{regime}|{scope}", drawn)}
+            for scope, part in scopes
+            if part["points"].notna().any()
+        ]
+    return pd.DataFrame(table, columns=pd.Index(GRADED_CUTS.names))
+
+
+def _name(scope: int) -> str:
+    return f"{SCOPES[scope]:g} to {[*SCOPES, 1.0][scope + 1]:g}"
+
+
+def _labels(votes: pd.DataFrame, asked: Mapping[str, Asked]) -> dict[tuple[Any, ...], str]:
+    """Return the answer of each response by more than half of its judges, "" for one that is none of the item's; no
+    entry without such a majority."""
+    cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
+    chosen = dict[tuple[Any, ...], str]()
+    for key, own in cast(Any, cast_votes.groupby(_ANSWER)):
+        said = [
+            asked[key[0]].label_of(value if isinstance(value, str) else None) or ""
+            for value in own.loc[own["valid"].astype(bool), "extracted_value"]
+        ]
+        label, n = Counter(said).most_common(1)[0] if said else ("", 0)
+        if n > len(own) / 2:
+            chosen[key] = label
+    return chosen
+
+
+def _of_verdict(item: Asked, abstained: object, label: str | None) -> dict[str, float]:
+    """Return what a decision of the panel comes to; nothing where it is undecided."""
+    if pd.isna(cast(Any, abstained)) or (not abstained and label is None):
+        return {}
+    return decided(item, None if abstained else label)
+
+
+def _of_probabilities(item: Asked, stated: Mapping[str, float] | None) -> dict[str, float]:
+    """Return what stated probabilities come to; nothing where there are none. Who acts on them answers the largest,
+    and from ANSWER_FROM on."""
+    if stated is None:
+        return {}
+    likeliest = max(stated, key=lambda label: stated[label])
+    acts = decided(item, likeliest if stated[likeliest] >= ANSWER_FROM - _ROUNDING else None)
+    return acts | {"brier": brier(item.posterior, stated), "stated": stated[_commonest(item.posterior)]}
+
+
+def decided(item: Asked, label: str | None) -> dict[str, float]:
+    """Return the figures of one decision, an answer or an abstention (None): what it is expected to earn, and what an
+    ideal observer earns more, and why."""
+    posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
+    best, own = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
+    ideal, answers = max(0.0, earned(best)), label is not None
+    points = earned(own) if answers else 0.0
+    return {
+        "answers": float(answers),
+        "wrong": 1 - own if answers else np.nan,
+        "points": points,
+        "regret": ideal - points,
+        "regret_label": earned(best) - earned(own) if answers else 0.0,
+        "regret_rash": ideal - earned(best) if answers else 0.0,
+        "regret_shy": 0.0 if answers else ideal,
+        "abstains_right": np.nan if earned(best) > 0 else float(not answers),
+        "abstains_wrong": float(not answers) if earned(best) > 0 else np.nan,
+        "brier_ideal": brier(posterior, posterior),
+        "brier_even": brier(posterior, even),
+        "points_ideal": ideal,
+        "points_best": earned(best),
+        "points_prior": earned(posterior.get(item.commonest, 0.0)),
+    }
+
+
+def earned(probability: float) -> float:
+    """Return the points that an answer is expected to earn which is right with some probability."""
+    return probability - WRONG_COSTS * (1 - probability)
+
+
+def brier(posterior: Mapping[str, float], stated: Mapping[str, float]) -> float:
+    """Return the expected Brier score of stated probabilities, from 0 to 2: of each answer by its probability, the
+    squared distances of what is stated from 1 for it and from 0 for all others."""
+    apart = sum((stated.get(label, 0.0) - posterior.get(label, 0.0)) ** 2 for label in {*stated, *posterior})
+    return apart + 1 - sum(p**2 for p in posterior.values())
+
+
+def _commonest(posterior: Mapping[str, float]) -> str:
+    return max(posterior, key=lambda label: posterior[label])
+
+
+def _row(items: pd.DataFrame, named: str, drawn: Drawn) -> dict[str, Any]:
+    """Return the figures of some items of a model and regime; a scenario counts once, with the mean over its runs."""
+    with_decision = items.loc[items["points"].notna()]
+    of = with_decision.groupby("scenario_id")[_FIGURES].mean()
+    row: dict[str, Any] = {
+        "n_runs": with_decision["run"].nunique(),
+        "n_items": len(of),
+        "n_missing": len(items) - len(with_decision),
+        "coverage": of["answers"].mean(),
+        "risk": with_decision["wrong"].mean(),
+        **of[[*_MEANS]].mean(),
+        "panel": joined_epochs(items["panel"]),
+        "epoch": joined_epochs(items["epoch"]),
+        "benchmark_version": joined_versions(items["benchmark_version"]),
+    }
+    for name, (low, high) in WITH_INTERVAL.items():
+        ends = ends_of_mean((of[name].dropna() - low) / (high - low), drawn, f"{named}|{name}")
+        row |= with_interval(name, low + (high - low) * ends, (low, high))
+    return row
+
+
+def wrong_rows(table: pd.DataFrame) -> int:
+    """Return how many GRADED_CUTS rows break their definition: a figure outside its limits or its interval, a regret
+    that is not the sum of its parts, or not what is missing to the ideal. Null is not wrong."""
+    wrong = (table["regret"] - table[[*PARTS]].sum(axis=1)).abs().to_numpy(float) > _ROUNDING
+    wrong |= (table["points"] + table["regret"] - table["points_ideal"]).abs().to_numpy(float) > _ROUNDING
+    for name, (least, most) in WITH_INTERVAL.items():
+        low, value, high = (table[f"{name}{end}"].to_numpy(float) for end in ("_ci_low", "", "_ci_high"))
+        wrong |= (low > value + _ROUNDING) | (value > high + _ROUNDING) | (low < least) | (high > most)
+    return int(wrong.sum())
