@@ -74,7 +74,7 @@ def extract(workspace: Workspace, dataset: str) -> None:
 
 @pytest.fixture(scope="module")
 def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Extracted, probed and judged; a void's clip stands for both panels, a control's for the short clip: all controls."""
+    """Extracted, probed and judged; a void's clip stands for both panels, a control's for the short clip."""
     workspace = make_study(tmp_path_factory.mktemp("study"))
     for arm, shown in zip(ARMS, ("void", "void", "control"), strict=True):
         rows = []
