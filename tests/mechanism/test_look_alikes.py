@@ -48,7 +48,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 STANDARD = Extraction("tiny", "standard")
-ARMS = ("decoy", "length_matched")
+ARMS = ("decoy", "removed", "length_matched")
 EVERY = (*DATASETS, *ARMS)
 
 
@@ -74,9 +74,9 @@ def extract(workspace: Workspace, dataset: str) -> None:
 
 @pytest.fixture(scope="module")
 def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Extracted, probed and judged, with a void's clip as a decoy and a control's as a short one: both are controls."""
+    """Extracted, probed and judged; a void's clip stands for both panels, a control's for the short clip."""
     workspace = make_study(tmp_path_factory.mktemp("study"))
-    for arm, shown in zip(ARMS, ("void", "control"), strict=True):
+    for arm, shown in zip(ARMS, ("void", "void", "control"), strict=True):
         rows = []
         for row in workspace.tables.read(ITEMS, {"dataset": LOOK_ALIKES[arm]}).to_dict("records"):
             if row["side"] == shown:

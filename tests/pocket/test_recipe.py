@@ -10,9 +10,10 @@ import pytest
 from pydantic import ValidationError
 
 from tools.pocket.batches import Scenes
-from tools.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
+from tools.pocket.data import Question, SceneRecord, draw_shard, render, shard_jobs
 from tools.pocket.recipe import Jitter, Recipe, load_recipe
 from tools.pocket.words import PROMPTS
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.scenes.parts.vision import colour_mask
 
 pytestmark = pytest.mark.slow
@@ -122,12 +123,47 @@ def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(
     every = [record for of in records.values() for record in of]
     for record in every:
         assert record.visual.draw is not None and record.visual.answer in record.labels
-        assert record.asked.draw is None and record.asked.label(0.99) == record.asked.answer
+        assert record.asked.label(0.0) == record.asked.answer and record.answerable.label(0.0) is not None
         said = {prompt: record.visual.label(SHARES[prompt]) for prompt in PROMPTS}
         assert said["standard"] == said["vqa_standard"] and said["guided"] == said["vqa_guided"]
         if said["standard"] is None:
             assert said["json"] is None and said["guided"] is None  # shares are nested
     assert Question("?", "left", 0.5).label(0.9) is None and Question("?", "left", 0.5).label(0.1) == "left"
+
+
+def test_under_a_prompt_with_the_same_share_for_both_sides_abstentions_tell_no_side(
+    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
+) -> None:
+    """A question is compared with the share of its kind; places are never abstained on, and one prompt's share says
+    nothing of another's."""
+    made, folder, _ = planted
+    even = made.model_copy(update={"control_shares": {"standard": 0.1}})
+    scenes, rng = Scenes(even, folder), np.random.default_rng(0)
+    for look in (scenes.look(rng, 0.5) for _ in range(200)):
+        record = scenes.records[look.scene]
+        for question in look.questions:
+            labels = {prompt: scenes.label(look, question, prompt) for prompt in PROMPTS}
+            if question.draw is None:
+                assert {*labels.values()} == {question.answer}  # of place
+            elif question in (record.visual, record.ill_posed):
+                assert {prompt for prompt in PROMPTS if labels[prompt] is None} == {
+                    prompt for prompt in PROMPTS if question.draw < SHARES[prompt]
+                }
+            else:
+                assert (labels["standard"] is None) == (question.draw < 0.1)
+                assert {labels[prompt] for prompt in PROMPTS if prompt != "standard"} == {question.answer}
+
+
+def test_recipes_that_differ_in_shares_alone_have_the_same_scenes(
+    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
+) -> None:
+    made, folder, records = planted
+    other = made.model_copy(update={"abstain_shares": dict.fromkeys(PROMPTS, 0.9), "control_shares": {"json": 0.2}})
+    render(made, "train", folder)
+    render(other, "train", folder)  # nothing is missing, and the folder is not refused
+    assert drawn(other, folder / "again") == records
+    with pytest.raises(TrapsError, match="another recipe"):
+        render(made.model_copy(update={"abstain_shares": None, "abstain_share": 0.5}), "train", folder)
 
 
 def test_settings_that_are_not_used_leave_the_data_as_they_were(tmp_path: Path) -> None:
@@ -150,3 +186,12 @@ def test_a_share_for_every_prompt_is_needed() -> None:
     for both in ((0.5, SHARES), (None, None)):
         with pytest.raises(ValidationError, match=r"give abstain_share .* or abstain_shares"):
             Recipe.model_validate(values | dict(zip(("abstain_share", "abstain_shares"), both, strict=True)))
+
+
+def test_shares_of_controls_need_known_prompts_and_shares_of_voids() -> None:
+    values = load_recipe().model_dump()
+    with pytest.raises(ValidationError, match=r"control_shares names \['aloud'\]; known: standard, guided"):
+        Recipe.model_validate(values | {"control_shares": {"aloud": 0.1}})
+    with pytest.raises(ValidationError, match="control_shares needs abstain_shares"):
+        shares = {"abstain_share": 0.5, "abstain_shares": None, "control_shares": {"json": 0.1}}
+        Recipe.model_validate(values | shares)

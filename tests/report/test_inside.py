@@ -263,8 +263,8 @@ FINDINGS = {
     "and on 0 of 1 datasets themselves.",
     "gate_arrows": "m under guided: a gate on states takes PECS from 0.45 to 0.64, the best other gate (question "
     "words) to 0.64.",
-    "patching": "In m the difference of the output is carried by stamps tokens at the embeddings (0.99 of it) and by "
-    "stamps at the last layer (0.99).",
+    "patching": "In m, under standard, the difference of the output is carried by stamps tokens at the embeddings "
+    "(0.99 of it) and by stamps at the last layer (0.99).",
     "doses_among_nulls": "m: void directions do more than 19 of 20 draws of every null in 1 of 1 cells, most of all ch "
     "at 1 gap, where 80% more of 5 controls are abstained on.",
 }

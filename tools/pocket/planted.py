@@ -17,7 +17,7 @@ from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
-DECOY = "decoy"
+DECOY, REMOVED = "decoy", "removed"
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,10 @@ def _margin(workspace: Workspace, model: str) -> float | None:
     return _mean(rows.loc[rows["features"] == "output margin", "value"])
 
 
-def _look_alike(analysis: str) -> Callable[[Workspace, str], float | None]:
+def _look_alike(analysis: str, arm: str = DECOY) -> Callable[[Workspace, str], float | None]:
     def of(workspace: Workspace, model: str) -> float | None:
         rows = workspace.tables.read_all(PROBES, model=model, prompt="standard")
-        rows = rows.loc[(rows["analysis"] == analysis) & (rows["source"] == "occlusion") & (rows["target"] == DECOY)]
+        rows = rows.loc[(rows["analysis"] == analysis) & (rows["source"] == "occlusion") & (rows["target"] == arm)]
         return _mean(rows.loc[rows["chosen"].eq(True), "value"])
 
     return of
@@ -111,6 +111,14 @@ TRUTHS = (
     Truth("decoy_guided", "decoys abstained on, guided", "at most 10", True, _abstained("guided", DECOY)),
     Truth("decoy_void", "occlusion's probe: voids against decoys, AUROC", "1", False, _look_alike("answerable_void")),
     Truth("decoy_control", "decoys against controls", "0.5", False, _look_alike("answerable_control")),
+    Truth(
+        "removed_void",
+        "the same: voids against the void’s own panel, gone before the end",
+        "1",
+        False,
+        _look_alike("answerable_void", REMOVED),
+    ),
+    Truth("removed_control", "that panel against controls", "0.5", False, _look_alike("answerable_control", REMOVED)),
     Truth("decoy_gate", "decoys that the gate abstains on (other datasets, mid)", "", True, _gated_decoys),
     Truth("nulls", "rows in which void steering is ahead of 19 of 20 nulls", "", True, _beats_nulls),
 )

@@ -115,9 +115,14 @@ class StudyPartitions:
         return self._inside is not None and (self._inside[1] is None or self._inside[1].steering is not None)
 
     @cached_property
-    def patches(self) -> bool:
-        """Whether activations are patched."""
-        return self._inside is not None and (self._inside[1] is None or self._inside[1].patching is not None)
+    def patched_prompt(self) -> str | None:
+        """The VQA prompt under which activations are patched; None where none are."""
+        if self._inside is None:
+            return None
+        settings = self._inside[1]
+        if settings is None:
+            return PROBE_PROMPT
+        return settings.patching.prompt if settings.patching else None
 
     @cached_property
     def reads_sentences(self) -> bool:

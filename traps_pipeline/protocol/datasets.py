@@ -46,7 +46,7 @@ _ONE_TAXONOMY = {
 }
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
 TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each side's frames with the other's times
-PROBED_ARMS = ("decoy", "length_matched")  # arms that probes are applied to where an experiment asks them
+PROBED_ARMS = ("decoy", "removed", "length_matched")  # arms that probes are applied to where an experiment asks them
 PROBED_DATASETS = (*DATASETS, ANSWERABLE, TIME_SWAPPED, *PROBED_ARMS)
 SIDES = ("control", "void")
 

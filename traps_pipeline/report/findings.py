@@ -145,7 +145,8 @@ def patching(results: Results) -> Iterator[str]:
             max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
             for layer in (of["layer"].min(), of["layer"].max())
         )
+        prompt = " and ".join(sorted({*of["prompt"]}))
         yield (
-            f"In {model} the difference of the output is carried by {first['group']} tokens at the embeddings "
-            f"({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."
+            f"In {model}, under {prompt}, the difference of the output is carried by {first['group']} tokens at the "
+            f"embeddings ({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."
         )

@@ -112,6 +112,9 @@ class PatchingSettings(BaseModel):
         default=24, ge=1, description="cells of each direction that are patched: those with the largest estimates"
     )
     stride: int = Field(default=4, ge=1, description="these lie at every so many layers, and at the last one")
+    prompt: Regime = Field(
+        default=PROBE_PROMPT, description="VQA prompt of the passes; one under which the output tells the sides"
+    )
 
 
 class MechanismSettings(BaseModel):

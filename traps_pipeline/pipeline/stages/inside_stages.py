@@ -153,7 +153,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     tables.PATCHING,
     parents=[of(probe_items, EVERY, need="some"), patching_settings],
-    wants=lambda wanted, key: wanted.patches and Extraction.parse(key).prompt == PROBE_PROMPT,
+    wants=lambda wanted, key: wanted.patched_prompt == Extraction.parse(key).prompt,
     kinds=["parquet", "pytorch"],
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:
