@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import dagster as dg
 import pytest
@@ -63,3 +64,18 @@ def test_a_wrong_name_in_an_experiment_is_one_sentence_and_leaves_no_workspace(
     assert code == 1
     assert "must match [a-z0-9.-]+" in sentence and sentence.count("x.yaml: ") == 1
     assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.usefixtures("_forgets")
+@pytest.mark.parametrize("wrong", [{"scenarios": ["domino_chian-0001"]}, {"benchmark": "other"}], ids=str)
+def test_a_name_that_nothing_has_leaves_no_workspace_and_the_corrected_one_makes_it(
+    wrong: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right = {"name": "x", "models": ["oracle"], "panel": "rules", "scenarios": ["domino_chain-0001"]}
+    codes = []
+    for experiment in (right | wrong, right):
+        (tmp_path / "x.yaml").write_text(yaml.safe_dump(experiment))
+        codes.append(main(["init", str(tmp_path / "x.yaml"), "--workspace", str(tmp_path / "study")]))
+        codes.append((tmp_path / "study").exists())
+    assert codes == [1, False, 0, True]
+    assert str(next(iter(wrong.values()))) in capsys.readouterr().err

@@ -95,12 +95,14 @@ def test_a_short_key_blanks_no_ordinary_text_and_is_blanked_in_a_header(monkeypa
         ("Authorization: Bearer abc.def-123", "Authorization: Bearer ***"),
         ("[(b'x-api-key', b'sk-ant-0123')]", "[(b'x-api-key', b'***')]"),
         ('{"x-goog-api-key": "AIza0123456789"}', '{"x-goog-api-key": "***"}'),
+        ("OPENAI_API_KEY=sk-0123456789", "OPENAI_API_KEY=***"),
+        ("{'client_secret': 'abc-0123456789'}", "{'client_secret': '***'}"),
         ("GET https://h/v1?key=AIza0123456789&alt=sse", "GET https://h/v1?key=***&alt=sse"),
         ("postgresql://lab:pw@db:5432/traps", "postgresql://lab:***@db:5432/traps"),
         ("give postgresql://USER:PASSWORD@HOST:5432/DATABASE", "give postgresql://USER:PASSWORD@HOST:5432/DATABASE"),
         ("api_key: Field required", "api_key: Field required"),
     ],
-    ids=range(7),  # pytest puts the id into the environment
+    ids=range(9),  # pytest puts the id into the environment
 )
 def test_a_key_that_nobody_named_is_known_by_its_place(text: str, shown: str) -> None:
     assert redact(text) == shown

@@ -45,9 +45,9 @@ COMMANDS = (
     "plan {experiment}",
     "run {experiment} --until responses",
     "run {experiment} --until votes --no-preflight",
-    "models check own",
-    "requests export {experiment} --batch --out {out}",
-    "votes export {experiment} --out {out}",
+    "models test-panel own",
+    "study export-requests {experiment} --batch --out {out}",
+    "study export-votes {experiment} --out {out}",
     "doctor",
     *(f"dagster {MATERIALIZE} occlusion|{kind}__standard__run1" for kind in ("refusal", "answer")),
 )

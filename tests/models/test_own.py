@@ -126,3 +126,29 @@ def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypa
 def test_a_wrong_entry_of_ones_own_is_named_with_its_field(tmp_path: Path, old: str, new: str) -> None:
     with raises(TrapsError, "", "mine.yaml"):
         load_experiment(written(tmp_path, MINE.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("media: images", "media: images\n    key: sk-0123456789abcdef"),
+        ("media: images", "media: images\n    api_key: sk-0123456789abcdef"),
+        ("media: images", "media: images\n    params: {api_key: sk-0123456789abcdef}"),
+        ("media: images", "media: images\n    params: {extra_headers: {x-gate: sk-0123456789abcdef}}"),
+        ("media: images", "media: images\n    params: {extra_body: {7: [{auth_token: sk-0123456789abcdef}]}}"),
+        ("http://", "http://sk-0123456789abcdef@"),
+        ("http://", "http://me:sk-0123456789abcdef@"),
+        ("8000/v1", "8000/v1?token=sk-0123456789abcdef"),
+    ],
+)
+def test_a_key_that_stands_in_an_entry_is_refused_and_not_repeated(tmp_path: Path, old: str, new: str) -> None:
+    with pytest.raises(TrapsError, match=r"mine\.yaml: ") as raised:
+        load_experiment(written(tmp_path, MINE.replace(old, new)))
+    assert "0123456789" not in str(raised.value)
+
+
+def test_an_address_of_a_parameter_would_take_the_key_elsewhere(tmp_path: Path) -> None:
+    for name in ("api_base", "base_url"):
+        text = MINE.replace("media: images", f"media: images\n    params: {{{name}: 'http://elsewhere.invalid/v1'}}")
+        with raises(TrapsError, "base.yamlfile.parse_yaml_model", name):
+            load_experiment(written(tmp_path, text))

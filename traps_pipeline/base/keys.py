@@ -1,13 +1,27 @@
-"""Read keys from the environment: the one place that does, and that refuses a key which no header can carry."""
+"""Read keys from the environment: the one place that does, and that refuses a key which no header can carry.
+
+A key that stands in a file is refused, too: what an entry holds is kept in the ledger, the workspace and releases.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
+from collections.abc import Mapping
+from typing import Annotated, Any
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.redaction import remember
 
+# Parameters that hold a key, or send it elsewhere than to the account's address.
+_NO_PARAMETER = re.compile(
+    r"(api|access)[_-]?key$|(^|[_-])(token|secret|password|credentials|authorization|headers)$|^(api_base|base_url)$",
+    re.IGNORECASE,
+)
 _NAMES = {"\n": "a line break", "\r": "a carriage return", "\t": "a tab", " ": "a space"}
 
 
@@ -41,6 +55,31 @@ def check_key(variable: str, value: str) -> None:
     problem = _problem(value)
     if problem:
         raise TrapsError(f"{variable} {problem}: export it again, as printable ASCII characters without white space")
+
+
+def check_parameters(params: Mapping[str, Any]) -> None:
+    """Raise ValueError, which names no value, for a parameter of a call, at any depth, that holds a key or an
+    address."""
+    for name, value in params.items():
+        if _NO_PARAMETER.search(str(name)):  # a token's number in `logit_bias`
+            raise ValueError(
+                f"params: {name} is none, since parameters are kept as they are: export the key, name its variable as "
+                "`key`, and give the address as `base_url`"
+            )
+        for inner in value if isinstance(value, list) else [value]:
+            if isinstance(inner, Mapping):
+                check_parameters(inner)
+
+
+def check_address(address: str) -> str:
+    """Return the address itself. Raises ValueError, which does not repeat it, where it may hold a key."""
+    parts = urlsplit(address)
+    if parts.username is not None or parts.query or parts.fragment:
+        raise ValueError("holds more than scheme, host, port and path: export the key and name its variable as `key`")
+    return address
+
+
+Address = Annotated[str, AfterValidator(check_address)]
 
 
 def _problem(value: str) -> str:

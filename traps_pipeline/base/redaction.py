@@ -37,12 +37,12 @@ _IGNORED = bytes((*range(33), 127, *b"\"'`\\|"))
 _VALUE = r"""(?=[^\s"'\\]*\d|[^\s"'\\]{16})[^\s"'\\,;&<>(){}\[\]]{6,}"""  # has a digit, or is longer than a word
 # Secrets that nobody named: in a header, a parameter or an address.
 _UNKNOWN = re.compile(
-    r"""((?:\b(?:authorization|(?:x-(?:goog-)?)?api[-_]?key|password)|[?&](?:key|sig|access_token))"""
+    r"""((?:\b(?:authorization|[\w-]*(?:api[-_]?key|secret)|password)|[?&](?:key|sig|access_token))"""
     rf"""["'\\]*\s*[:=,]\s*b?["'\\]*(?:(?:bearer|basic)\s+)?|\b(?:bearer|basic)\s+){_VALUE}"""
     r"""|(://[^/\s:@"']*:)(?!PASSWORD@)[^/\s@"']+(?=@)""",
     re.IGNORECASE,
 )
-_SIGNS = ("authorization", "api", "password", "key=", "sig=", "access_token=", "bearer", "basic", "://")
+_SIGNS = ("authorization", "api", "secret", "password", "key=", "sig=", "access_token=", "bearer", "basic", "://")
 
 _variables = set[str]()
 _values = set[str]()

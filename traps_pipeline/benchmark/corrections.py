@@ -231,7 +231,7 @@ def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenari
         unknown = sorted(set(study.scenarios) - set(scenarios) - _ever_known())
         if unknown:
             near = did_you_mean(unknown[0], scenarios) or "; `ls scene_specs/released` shows the families"
-            raise TrapsError(f"study.yaml: unknown scenarios {unknown}{near}")
+            raise TrapsError(f"the study's `scenarios` name unknown ones, {unknown}{near}")
         return {id_: scenarios[id_] for id_ in sorted(study.scenarios) if id_ in scenarios}
     if study.per_family is None:
         return dict(scenarios)

@@ -41,12 +41,14 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     database: the variable with the address of the study's database, where one is asked for. Raises TrapsError if the
     existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
+    from traps_pipeline.benchmark.corrections import load_scenarios
     from traps_pipeline.models.own import keep
     from traps_pipeline.storage.workspace import Workspace
 
     place, by_rules = place_of(arguments), arguments.judged_by_rules
     if not Workspace.is_there(place):  # refused before a folder is made
         experiment.judged(None, arguments.panel, judged_by_rules=by_rules)
+        load_scenarios(experiment.study)
     workspace = Workspace.create(place, experiment.study.model_copy(update={"database": database}))
     if database is not None and workspace.study.database != database:
         raise TrapsError(

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.keys import read_key
+from traps_pipeline.base.keys import Address, check_parameters, read_key
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
@@ -64,7 +64,7 @@ class Account(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     key: str | None = Field(default=None, pattern=r"^[A-Z][A-Z0-9_]*$", description="environment variable of the key")
-    base_url: str | None = Field(default=None, description="of an OpenAI-compatible endpoint")
+    base_url: Address | None = Field(default=None, description="of an OpenAI-compatible endpoint")
     batch_price: float = Field(
         default=1.0, gt=0, le=1, description="price of a call in a batch, relative to a live one"
     )
@@ -150,6 +150,7 @@ class Entry(BaseModel):
             raise ValueError(f"account is {self.account!r}; {known}")
         if self.provider_id is None or "/" not in self.provider_id:
             raise ValueError(f"provider_id is {self.provider_id!r}; it is route/model, e.g. openai/gpt-5")
+        check_parameters(self.params)
         self._check_waivers(self.protocol())
         if self.prices and (self.prices.input or self.prices.output) and not self.max_tokens:
             raise ValueError("params.max_tokens is not sent: without it no budget can bound what a call costs")
