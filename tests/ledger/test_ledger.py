@@ -260,17 +260,6 @@ def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: L
     assert json.dumps(ledger.read("m").rows["a"]["text"]) == '"left"'
 
 
-def test_an_error_in_a_writers_block_is_what_is_raised(ledger: Ledger) -> None:
-    async def scenario() -> None:
-        async with ledger.writing("m", print) as writer:
-            await writer.write(answer("a", "left"))
-            raise TrapsError("something else")
-
-    with pytest.raises(TrapsError, match="something else"):
-        asyncio.run(scenario())
-    assert list(ledger.read("m").rows) == ["a"]
-
-
 def test_no_bit_of_a_row_can_flip_unseen(tmp_path: Path) -> None:
     """Bits all over the file of a small ledger: the rows come back as they were, or something is said."""
     rows = [answer(f"k{n}", "left") for n in range(3)]

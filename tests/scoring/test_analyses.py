@@ -8,7 +8,6 @@ from tests.build.errors import raises
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
-    degenerate_strategies,
     hidden_against_others,
     models_of,
     naive_gap,
@@ -171,12 +170,6 @@ def test_a_single_run_has_no_deviation_rather_than_one_of_0():
         cell("three") | runs | {"n_runs": 3, "false_abs_std": 0.2, "pecs_std": 0.04},
     )
     assert spread(study_cells(board)).iloc[0].tolist() == pytest.approx([0.04, 0.04, 0.04, 1])
-
-
-def test_every_degenerate_strategy_scores_zero():
-    table = degenerate_strategies()
-    assert len(table) == 6
-    assert (table["pecs"] == 0).all()
 
 
 def scoped(scope, regime, dataset, abs_rec, run=1, **other):

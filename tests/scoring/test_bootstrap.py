@@ -49,11 +49,6 @@ def test_intervals_narrow_with_more_scenarios_and_are_never_of_no_width(rows):
     assert 0 < widths[-1] < 0.04 < 0.9 < widths[0]
 
 
-def test_right_and_wrong_exchanged_reflect_the_interval(rows):
-    (low, high), (other_low, other_high) = share_interval(rows, 5, 20), share_interval(rows, 15, 20)
-    assert (low, high) == pytest.approx((1 - other_high, 1 - other_low), abs=0.01)
-
-
 def test_the_oracles_interval_ends_at_one_and_has_a_width(rows, strategy):
     table = pecs_intervals(everywhere(rows, strategy("oracle", 30)), resamples=500)
     assert list(table.columns) == [*ENTRY, *INTERVAL_COLUMNS]

@@ -90,13 +90,6 @@ def test_a_folder_without_a_study_says_how_to_make_one(tmp_path: Path) -> None:
         Workspace.open(tmp_path)
 
 
-def test_the_workspace_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path))
-    assert Workspace.default_place() == tmp_path
-    monkeypatch.delenv("TRAPS_WORKSPACE")
-    assert Workspace.default_place().parts[-2:] == (".workspaces", "default")
-
-
 def test_paths_are_absolute_however_the_workspace_was_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert Workspace.create(Path("w"), Study()).root == tmp_path / "w"
