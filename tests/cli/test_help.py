@@ -62,23 +62,19 @@ def test_a_misspelt_word_is_bad_usage_with_the_nearest_one(
     assert hint in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("traps stu", "study"),
-        ("traps study pl", "plan"),
-        ("traps run hyp", "hypotheses hypotheses-pocket"),
-        ("traps study run demo --unt", "--until"),
-        ("traps publish ver", "verify"),
-    ],
-)
-def test_a_shell_completes_commands_options_and_experiments(words: str, expected: str) -> None:
-    script = subprocess.run(
-        [sys.executable, "-m", "traps_pipeline.cli", "completion", "bash"], cwd=ROOT, capture_output=True, text=True
-    ).stdout
-    asked = f"COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _traps; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True)
-    assert (done.stdout.strip(), done.stderr) == (expected, "")
+def test_a_shell_completes_commands_options_and_experiments() -> None:
+    command = [sys.executable, "-m", "traps_pipeline.cli", "completion", "bash"]
+    script = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for words, expected in {
+        "traps stu": "study",
+        "traps study pl": "plan",
+        "traps run hyp": "hypotheses hypotheses-pocket",
+        "traps study run demo --unt": "--until",
+        "traps publish ver": "verify",
+    }.items():
+        asked = f"COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _traps; echo ${{COMPREPLY[@]}}"
+        done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True)
+        assert (done.stdout.strip(), done.stderr) == (expected, "")
 
 
 def test_the_page_of_commands_is_what_the_parser_says_and_every_argument_has_a_meaning() -> None:
