@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, cast
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -293,14 +292,6 @@ def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no
     assert all(any("answers per cell" in note for note in found[name].notes) and
                any(note.startswith("† and means of such cells") for note in found[name].notes)
                for name in ("steering_top", "steering_dose", "steering_regimes", "steering_domains"))  # fmt: skip
-
-
-def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
-    plane = next(report for report in FIGURES if report.name == "gate_arrows").make(Made()).axes[0]
-    assert plane.get_xlabel().startswith("J =") and plane.get_ylabel().startswith("Acc")
-    points = {(round(x, 6), round(y, 6)) for marks in plane.collections for x, y in np.asarray(marks.get_offsets())}
-    assert points >= {(0.5, 0.9), (0.8, 0.8)}  # J = 0.5 - 0 before the gate, 0.9 - 0.1 behind it
-    assert (0.9, 0.5) not in points
 
 
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:

@@ -85,15 +85,6 @@ def test_a_board_falls_as_things_fall_from_above_the_picture() -> None:
     assert [offset[2] for offset in board[3:8] if offset][::-1] == pytest.approx(heights, abs=1e-9)
 
 
-def test_before_a_camera_that_looks_down_a_board_slides_in_from_its_side_of_the_picture() -> None:
-    camera = Camera((0.0, 0.0, 0.0), 2.0, 90.0, -60.0, 45.0, 1.0, (0.0, 0.0, 0.0))
-    left, right = (coming_board(Closing(8, Panel((x, 0.0, 0.3), (0.2, 0.1, 0.3), 0.0)), camera, 9, 10) for x in (-1, 1))
-    for board, side in ((left, -1), (right, 1)):
-        ways = [offset for offset in board[:8] if offset is not None]
-        assert ways and all(side * x > 0 and (y, z) == pytest.approx((0, 0)) for x, y, z in ways)
-    assert coming_board(None, camera, 3, 10) == [None] * 3
-
-
 def altered(spec: SceneSpec, **changes: Any) -> SceneSpec:
     assert spec.control is not None
     return SceneSpec.model_validate(spec.model_dump() | {"control": spec.control | changes})

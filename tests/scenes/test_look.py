@@ -19,7 +19,6 @@ from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.redraw import relook_family, with_look
 from traps_pipeline.scenes.draw.sample import load_tallies, record_line, save_tallies
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.floor import PALE
 from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
 from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.picture.render import Renderer
@@ -68,13 +67,6 @@ def test_a_draws_look_follows_from_its_number_and_varies_in_the_parts_that_are_n
     floor = look_of_draw(1, "bounce", 4, ("floor",))
     assert floor is not None and floor.floor_pattern is not None
     assert replace(floor, **{f: getattr(Look(), f) for f in vars(floor) if f.startswith("floor_")}) == Look()
-
-
-def test_pale_floors_have_no_dark_tone_and_count_before_others() -> None:
-    pale = [look_of_draw(1, "bounce", number, ("pale-floor",)) for number in range(60)]
-    assert {tone for look in pale if look for tone in look.floor_tones} == set(PALE)
-    assert pale == [look_of_draw(1, "bounce", number, ("floor", "pale-floor")) for number in range(60)]
-    assert pale != [look_of_draw(1, "bounce", number, ("floor",)) for number in range(60)]
 
 
 def test_released_records_look_as_their_draws_say_and_differ() -> None:

@@ -224,13 +224,3 @@ def test_an_observer_sees_no_flag_and_sees_what_is_no_flag() -> None:
     bare = frames.copy()
     bare[:, 100:160, 60:63] = 200  # without its mast it is a thing
     assert np.array_equal(vision.without_flags(bare), bare)
-
-
-def test_how_far_a_body_turns_is_its_greatest_angle_from_where_it_stands_at_first() -> None:
-    def about_z(degrees: float) -> np.ndarray:
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-
-    path = np.stack([about_z(20 + turn) for turn in (0, 5, -12, 3)])
-    assert outcome.turns_deg(path) == pytest.approx(12.0, abs=1e-6)
-    assert outcome.turns_deg(path[:1]) == 0.0

@@ -44,10 +44,6 @@ def test_the_deviation_over_runs_divides_by_the_number_of_runs(rows):
     assert (row.abs_rec_std, row.false_abs_std, row.j_std) == (0.0, 0.0, 0.0)
 
 
-def test_one_run_has_deviation_zero(rows):
-    assert entry(board_of(rows([(True, False, True), (False, False, True)]))).pecs_std == 0.0
-
-
 def test_overall_weighs_datasets_equally_within_each_run(rows):
     # PECS per run = AbsRec here. Run 1: 1, 0, 0, 0 -> 0.25. Run 2: 1, 1, 1, 0 -> 0.75. Sizes differ and do not matter.
     recognised = {1: (True, False, False, False), 2: (True, True, True, False)}

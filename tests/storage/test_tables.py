@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 import pyarrow as pa
-import pytest
 
-from tests.build.errors import raises
 from tests.tables import TABLES
 from traps_pipeline.storage.tables import Table
 
@@ -43,22 +41,6 @@ def test_types_nulls_meanings_and_order_are_the_annotations() -> None:
     assert [(f.name, f.type, f.nullable, f.metadata[b"doc"]) for f in schema] == expected
     types = ["str", "list[str]", "float", "int", "bool", "datetime"]
     assert [column.type_name for column in PARCELS.columns] == types
-
-
-@pytest.mark.parametrize("key", [{"key": ("id", "colour")}, {"partition_by": ("colour",)}])
-def test_a_key_or_partition_that_is_no_column_is_refused_by_name(key: dict[str, Any]) -> None:
-    with raises(ValueError, "storage.tables.Table.__post_init__", "parcels", "ParcelRow", "colour"):
-        Table("parcels", ParcelRow, **({"partition_by": (), "key": ()} | key))
-
-
-@pytest.mark.parametrize(
-    "annotation",
-    [str, Annotated[bytes, "a type that no file holds"], Annotated[int | str, "two types"], Annotated[None, "none"]],
-)
-def test_an_annotation_that_says_no_column_is_refused_by_name(annotation: Any) -> None:
-    row_type = dataclass(type("OddRow", (), {"__annotations__": {"size": annotation}}))
-    with raises(TypeError, "storage.tables._columns", "OddRow", "size"):
-        _ = Table("odd", row_type, partition_by=(), key=("size",)).columns
 
 
 def test_every_column_of_a_table_says_what_it_holds() -> None:
