@@ -44,6 +44,11 @@ class Finished:
     out: str
     err: str
 
+    def ok(self) -> Finished:
+        """Itself; fails with what the command said where it did not end with 0."""
+        assert self.code == 0, f"{self.out[-3000:]}\n{self.err[-3000:]}"
+        return self
+
     def counts(self) -> dict[str, int]:
         """Answers asked, votes asked, frames rendered, as the last lines say."""
         found = re.search(r"(\d+) answers asked .*?(\d+) votes asked .*?(\d+) frames rendered", self.out, re.DOTALL)

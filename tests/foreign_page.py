@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import http.server
 import json
-import shutil
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from playwright.sync_api import sync_playwright
 
-from tests.pages import patient
+from tests.pages import CHROMIUM, QUIET, patient
 
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-QUIET = [
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-sync", "--disable-component-update"),
-]
 REBOUND = "rebound.test"  # a name that its owner has bound to this machine
 
 PAGE = """<!doctype html><title>working</title><body><script>

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -56,30 +55,6 @@ def test_checks_run_on_every_python_that_the_package_admits_and_every_shard_at_n
     assert check["jobs"]["check"]["strategy"]["matrix"]["python"] == classifiers
     shards = nightly["jobs"]["campaign"]["strategy"]["matrix"]["shard"]
     assert shards == [f"{k}/{len(shards)}" for k in range(1, len(shards) + 1)]
-
-
-def test_owners_own_what_there_is_and_every_owner_is_a_placeholder() -> None:
-    lines = [line.split() for line in (ROOT / ".github/CODEOWNERS").read_text().splitlines() if line[0] != "#"]
-    for pattern, *owners in lines:
-        assert [*ROOT.glob(pattern.strip("/"))], pattern
-        assert owners and all(owner.startswith("@OWNER/") for owner in owners)
-
-
-def test_the_files_of_hosts_and_editors_are_what_their_readers_take() -> None:
-    json.loads((ROOT / "renovate.json").read_text())
-    for form in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml"):
-        yaml.safe_load(form.read_text())
-    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
-    assert {hook["id"] for hook in hooks} == {
-        "ruff-check",
-        "ruff-format",
-        "locks",
-        "typos",
-        "private-key",
-        "large-file",
-    }
-    asked = [ROOT / ".github/ISSUE_TEMPLATE/bug.yml", ROOT / ".github/PULL_REQUEST_TEMPLATE.md"]
-    assert all("traps doctor" in file.read_text() for file in asked)
 
 
 def test_make_help_names_the_targets_of_users_first_and_those_of_maintainers_after_them() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -95,27 +95,25 @@ def test_contributing_lists_the_rooms_from_top_to_bottom() -> None:
     assert len(lines) <= 10
 
 
-def test_no_room_imports_one_above_it() -> None:
-    known, height = files(), {room: number for number, room in enumerate(ROOMS)}
-    upwards = [
+def upwards(below: str, order: Sequence[str]) -> list[str]:
+    """Imports of a folder above one's own, of all modules below a package whose folders lie in this order."""
+    known = {module: path for module, path in files().items() if module.startswith(f"{below}.")}
+    height, deep = {folder: number for number, folder in enumerate(order)}, below.count(".") + 1
+    return [
         f"{path.relative_to(PACKAGE)}:{line} imports {name}"
         for module, path in known.items()
         for line, name in imported(path.read_text(encoding="utf-8"), known)
-        if room_of(module) and height[room_of(name)] > height[room_of(module)]
+        if height[name.split(".")[deep]] > height[module.split(".")[deep]]
     ]
-    assert upwards == []
+
+
+def test_no_room_imports_one_above_it() -> None:
+    assert upwards(PACKAGE.name, ROOMS) == []
 
 
 def test_no_folder_of_the_scenes_imports_one_above_it() -> None:
-    known = {module: path for module, path in files().items() if module.startswith("traps_pipeline.scenes.")}
-    assert {module.split(".")[2] for module in known} == {*SCENES}
-    upwards = [
-        f"{path.relative_to(PACKAGE)}:{line} imports {name}"
-        for module, path in known.items()
-        for line, name in imported(path.read_text(encoding="utf-8"), known)
-        if SCENES.index(name.split(".")[2]) > SCENES.index(module.split(".")[2])
-    ]
-    assert upwards == []
+    assert {module.split(".")[2] for module in files() if module.startswith("traps_pipeline.scenes.")} == {*SCENES}
+    assert upwards("traps_pipeline.scenes", SCENES) == []
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:

@@ -58,7 +58,6 @@ def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
 @pytest.mark.parametrize(
     ("selection", "complete", "passed", "failed"),
     [
-        ("not slow and not promise", False, {"test_quick"}, {"test_dear"}),
         ("promise or not slow", False, {"test_quick", "test_promise"}, {"test_dear"}),
         ("slow and not promise", False, {"test_slow"}, set()),
         ("not slow and not promise", True, {"test_quick"}, {"test_dear", "test_lacking"}),

@@ -115,12 +115,10 @@ def test_the_wheel_holds_the_package_and_its_data_and_nothing_else(wheel: Path) 
 
 def test_an_installed_wheel_makes_a_leaderboard_in_a_folder_that_is_no_checkout(installed: Installed) -> None:
     assert installed.traps("--help").out.startswith("usage: traps")
-    looked = installed.traps("doctor")
-    assert looked.code == 0, looked.out
+    looked = installed.traps("doctor").ok()
     assert f"{installed.shipped}: trapsbench 0.2.0, 702 scenarios" in looked.out
     (installed.work / "tiny.yaml").write_text(EXPERIMENT)
-    finished = installed.traps("run", "tiny.yaml", "--until", "leaderboard")
-    assert finished.code == 0, finished.out + finished.err
+    finished = installed.traps("run", "tiny.yaml", "--until", "leaderboard").ok()
     # Two models, an occlusion scenario each with its ill-posed twin: 2 x 2 x (2 pairs of 2 items).
     assert finished.counts()["answers"] == 2 * 2 * 4
     assert not [path for path in installed.shipped.rglob("*") if path.name == "__pycache__"]
@@ -163,6 +161,5 @@ def test_the_shipped_benchmark_is_not_changed_and_a_copy_of_it_is(installed: Ins
     assert "came with the installed package and is not changed; copy" in refused.err
     assert {path: path.stat().st_mtime_ns for path in installed.shipped.rglob("*")} == before
     subprocess.run(["cp", "-r", installed.shipped / "scene_specs", installed.work / "mine"], check=True)
-    taken = installed.run(installed.python, "-c", code, TRAPS_SCENE_SPECS=str(installed.work / "mine"))
-    assert taken.code == 0, taken.err
+    installed.run(installed.python, "-c", code, TRAPS_SCENE_SPECS=str(installed.work / "mine")).ok()
     assert '"plinko-0001"' in (installed.work / "mine" / "corrections" / "review.jsonl").read_text()

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -89,21 +88,6 @@ def test_a_durable_file_that_does_not_reach_the_disk_does_not_take_the_place(
         write_bytes(file, b"next", durable=True)
     assert file.read_text() == "former"
     assert alone(file)
-
-
-def test_many_threads_that_write_one_file_leave_one_of_their_contents_whole(file: Path) -> None:
-    contents = [bytes([k]) * 100_000 for k in range(32)]
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda content: write_bytes(file, content), contents))
-    assert file.read_bytes() in contents
-    assert alone(file)
-
-
-def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
-    write_text(tmp_path / "results", "a file")
-    with raises(TrapsError, "base.files.replacing", "results/table.csv"):
-        write_text(tmp_path / "results" / "table.csv", "content")
-    assert (tmp_path / "results").read_text() == "a file"
 
 
 def test_a_missing_file_that_the_block_reads_is_not_taken_for_one_that_cannot_be_written(file: Path) -> None:

@@ -16,7 +16,6 @@ from traps_pipeline.protocol.datasets import (
     datasets_of_category,
     is_ill_posed,
     taxonomy_of,
-    transfer_type,
 )
 
 
@@ -43,29 +42,25 @@ def test_a_cell_reads_as_the_design_says() -> None:
     assert list(cell.partition) == ["dataset", "model", "regime", "run"]
 
 
+SHAPES = ["m__guided", "m__guided__1", "m__guided__runx", "m__guided__run", "m__guided__run0", "m__guided__run01"]
+SHAPES += ["m__guided__run²", "m__warm__run1", "__guided__run1", "m__guided__run1__x", "m__guided__run-1", ""]
+SHAPES += ["m__guided__run1\n"]
+NAMES = ["M__guided__run1", "a b__guided__run1", "a__b__guided__run1"]
+CELLS = ["pachinko|m__guided__run1", "m__guided__run1", "occlusion", "|m__guided__run1", ""]
+
+
 @pytest.mark.parametrize(
-    "key",
+    ("of", "by", "keys"),
     [
-        *("m__guided", "m__guided__1", "m__guided__runx", "m__guided__run", "m__guided__run0", "m__guided__run01"),
-        *("m__guided__run²", "m__warm__run1"),
-        *("__guided__run1", "m__guided__run1__x", "m__guided__run-1", "", "m__guided__run1\n"),
+        (Evaluation, "protocol.cells", SHAPES),
+        (Evaluation, "base.names.check_name", NAMES),
+        (Cell, "protocol.cells", CELLS),
     ],
 )
-def test_a_wrong_evaluation_key_is_refused(key: str) -> None:
-    with raises(ValueError, "protocol.cells"):
-        Evaluation.parse(key)
-
-
-@pytest.mark.parametrize("key", ["M__guided__run1", "a b__guided__run1", "a__b__guided__run1"])
-def test_a_key_with_a_wrong_name_is_refused(key: str) -> None:
-    with raises(ValueError, "base.names.check_name"):
-        Evaluation.parse(key)
-
-
-@pytest.mark.parametrize("key", ["pachinko|m__guided__run1", "m__guided__run1", "occlusion", "|m__guided__run1", ""])
-def test_a_wrong_cell_key_is_refused(key: str) -> None:
-    with raises(ValueError, "protocol.cells"):
-        Cell.parse(key)
+def test_a_wrong_key_is_refused(of: type[Cell | Evaluation], by: str, keys: list[str]) -> None:
+    for key in keys:
+        with raises(ValueError, by):
+            of.parse(key)
 
 
 def test_an_extension_is_no_category_of_the_benchmark_and_its_voids_are_those_of_a_panel() -> None:
@@ -76,10 +71,3 @@ def test_an_extension_is_no_category_of_the_benchmark_and_its_voids_are_those_of
     assert datasets_of_category("plinko") == ("chaotic", "chaotic_ill_posed")
     assert [taxonomy_of(d) for d in DATASETS] == ["occlusion", "occlusion", "chaotic", "chaotic"]
     assert [is_ill_posed(d) for d in DATASETS] == [False, True, False, True]
-
-
-def test_transfer_types_follow_the_definitions() -> None:
-    assert transfer_type("occlusion", "occlusion_ill_posed") == "Cross-modality"
-    assert transfer_type("occlusion_ill_posed", "chaotic_ill_posed") == "Cross-domain"
-    assert transfer_type("occlusion", "chaotic_ill_posed") == "Cross-both"
-    assert transfer_type("chaotic", "chaotic") == "Within"

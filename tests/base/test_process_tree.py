@@ -57,8 +57,10 @@ def tree(tmp_path: Path) -> tuple[subprocess.Popen[bytes], int]:
     return process, int(ready.read_text())
 
 
-@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
-@pytest.mark.parametrize("which", ["first", "second"])
+@pytest.mark.parametrize(
+    ("which", "stop"),
+    [("first", signal.SIGTERM), ("first", signal.SIGKILL), ("second", signal.SIGHUP), ("second", signal.SIGKILL)],
+)
 def test_a_stop_of_either_process_ends_all_that_both_started(
     tree: tuple[subprocess.Popen[bytes], int], tmp_path: Path, which: str, stop: signal.Signals
 ) -> None:

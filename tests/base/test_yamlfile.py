@@ -11,9 +11,8 @@ import yaml
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import parse_yaml_model, read_lines, read_yaml
+from traps_pipeline.base.yamlfile import read_lines, read_yaml
 from traps_pipeline.pipeline.experiment import load_experiment
-from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -82,13 +81,6 @@ def test_a_budget_is_a_number_and_nothing_that_looks_like_one(tmp_path: Path, sa
     (tmp_path / "study.yaml").write_text(f"format: 1\nbudget_usd: {said}\n")
     with raises(TrapsError, "base.yamlfile", "study.yaml"):
         Workspace.open(tmp_path)
-
-
-def test_a_word_is_no_truth_and_a_number_neither(file: Path) -> None:
-    for said in ("yes", "1", '"true"'):
-        file.write_text(f"allow_unknown_prices: {said}")
-        with raises(TrapsError, "base.yamlfile.parse_yaml_model"):
-            parse_yaml_model(Study, read_yaml(file), file)
 
 
 @pytest.mark.parametrize(

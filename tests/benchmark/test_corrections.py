@@ -10,7 +10,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import Scenario, categories_of, fold, read_corrections, subset
+from traps_pipeline.benchmark.corrections import Scenario, fold, read_corrections, subset
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.study import Study
@@ -35,13 +35,9 @@ def correct(**changes: Any) -> dict[str, Any]:
 
 def test_without_decisions_the_benchmark_is_the_release(tmp_path: Path) -> None:
     scenarios = fold(RELEASED, read_corrections(tmp_path))
+    assert scenarios == decide(tmp_path, {"scenario_id": ID, "action": "keep"})
     assert list(scenarios) == sorted(RELEASED)
     assert all(s.changed_words() is RELEASED[id_] for id_, s in scenarios.items())
-
-
-def test_keeping_changes_nothing(tmp_path: Path) -> None:
-    kept = decide(tmp_path, {"scenario_id": ID, "action": "keep"})
-    assert kept == fold(RELEASED, ())
 
 
 def test_a_corrected_question_changes_the_words_and_not_the_scene(tmp_path: Path) -> None:
@@ -67,13 +63,6 @@ def test_a_later_decision_adds_to_an_earlier_one_and_wins_where_both_speak(tmp_p
     )
     spec = scenarios[ID].changed_words()
     assert (spec.question, spec.ill_posed_question, spec.ground_truth) == ("C?", "B?", OTHER_LABEL)
-
-
-def test_files_are_read_in_the_order_of_their_names(tmp_path: Path) -> None:
-    signed = {"who": "jd", "when": "2026-11-21", "why": "reviewed"}
-    for name in ("b", "a"):
-        (tmp_path / f"{name}.jsonl").write_text(json.dumps(signed | correct(question=f"{name}?")) + "\n")
-    assert fold(RELEASED, read_corrections(tmp_path))[ID].changed_words().question == "b?"
 
 
 def test_new_labels_come_with_aliases_and_an_answer_among_them(tmp_path: Path) -> None:
@@ -155,9 +144,3 @@ def test_a_discarded_scenario_falls_out_of_a_study_that_names_it_and_an_unknown_
     assert list(subset(scenarios, Study(scenarios=[ID, "hidden_race-0002"]))) == ["hidden_race-0002"]
     with raises(TrapsError, "benchmark.corrections.subset", "['domino_chain-7777']"):
         subset(scenarios, Study(scenarios=["domino_chain-7777"]))
-
-
-def test_categories_stand_in_their_fixed_order() -> None:
-    present = categories_of(fold(RELEASED, ()))
-    assert present.index("hidden") < present.index("dominoes")
-    assert set(present) == {spec.category for spec in RELEASED.values()}

@@ -78,13 +78,6 @@ def test_a_line_that_is_no_record_names_its_file_and_line(tmp_path: Path, line: 
         load_released(write(tmp_path, records()[0], "", line))
 
 
-def test_a_missing_field_is_named(tmp_path: Path) -> None:
-    one = records()[0]
-    del one["camera"]
-    with raises(TrapsError, "benchmark.records.parse_record", "some.jsonl:1"):
-        load_released(write(tmp_path, one))
-
-
 def test_an_id_that_occurs_twice_names_the_second_line(tmp_path: Path) -> None:
     one, two = records()
     with raises(TrapsError, "benchmark.records.load_released", "some.jsonl"):

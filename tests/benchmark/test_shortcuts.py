@@ -9,8 +9,6 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.benchmark.shortcuts import shortcuts
-from traps_pipeline.report.figures.grids import shortcut_figure
-from traps_pipeline.report.writing import figure_bytes
 from traps_pipeline.video.encode import encode
 
 SCENARIOS = 10
@@ -74,10 +72,3 @@ def test_only_the_planted_cue_tells_control_from_void(
     assert (rows["n_pairs"] == SCENARIOS).all()
     assert (rows.loc[sorted(telling), "accuracy"] >= 0.8).all(), rows
     assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
-
-
-def test_too_few_scenarios_give_no_row_and_still_a_figure(table: pd.DataFrame) -> None:
-    items = pd.DataFrame({c: [] for c in ("dataset", "scenario_id", "pair_id", "side", "question", "clip")})
-    few = shortcuts(items, pd.DataFrame({c: [] for c in ("path", "duration_s", "size_bytes")}), Path())
-    assert list(few.columns) == list(table.columns) and few.empty
-    assert figure_bytes(shortcut_figure(few)).startswith(b"\x89PNG")

@@ -29,8 +29,8 @@ def corrected(*changes: dict) -> Scenario:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["hidden_race-0003", "domino_chain-0002"])
-def test_another_camera_keeps_every_word(workspace: Workspace, scenario_id: str) -> None:
+def test_another_camera_keeps_every_word(workspace: Workspace) -> None:
+    scenario_id = "domino_chain-0002"
     released = load_released()[scenario_id]
     azimuth = released.params["azimuth_deg"] + 2.0
     spec = resolve_scenario(workspace, corrected({"scenario_id": scenario_id, "params": {"azimuth_deg": azimuth}})).spec

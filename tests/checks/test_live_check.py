@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import socket
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +12,6 @@ from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
-from traps_pipeline.checks import live_check
 from traps_pipeline.checks.live_check import Live, check_live
 from traps_pipeline.models import api, registry
 from traps_pipeline.models.judges import JudgeEntry
@@ -52,18 +50,6 @@ def test_a_model_that_answers_sees_and_keeps_to_the_schema_is_sound(check: Check
     assert (live.problems, live.notes) == ([], [])
 
 
-def test_what_is_wrong_is_named_within_half_a_minute() -> None:
-    assert live_check.REACH_S + live_check.TIMEOUT_S <= 30
-
-
-def test_a_dead_endpoint_is_named_with_its_address(check: Check) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
-    (problem,) = check(address=address).problems
-    assert problem.startswith(f"nothing answers at {address}") and "start the server there" in problem
-
-
 def test_a_wrong_name_is_named_with_those_that_are_served(check: Check, provider: Provider) -> None:
     provider.configure(served=["other", "third"], fault_by_model={NAME: "not_found"})
     (problem,) = check().problems
@@ -78,12 +64,6 @@ def test_a_name_that_a_list_lacks_is_a_note_where_it_answers(check: Check, provi
     provider.configure(served=["an-example"])  # transformers serve lists what was downloaded, a mock lists examples
     live = check()
     assert live.problems == [] and "it lists an-example, and answers to that name" in live.notes[0]
-
-
-def test_a_server_that_breaks_is_told_from_one_that_refuses(check: Check, provider: Provider) -> None:
-    provider.configure(fault_by_model={NAME: "server_error"})
-    assert {problem.partition(":")[0] for problem in check().problems} == {"clip", "no clip"}
-    assert all("ends in an error of its own" in problem for problem in check().problems)
 
 
 @pytest.mark.parametrize(
@@ -128,18 +108,6 @@ def test_a_wrong_key_is_named_by_its_variable(check: Check, provider: Provider) 
     assert "a key is wanted" in problem and "`key`" in problem
 
 
-def test_a_model_that_ignores_images_is_named(check: Check, provider: Provider) -> None:
-    provider.configure(blind=[NAME])
-    (problem,) = check().problems
-    assert problem.startswith("it does not see the clip")
-
-
-def test_a_model_that_ignores_the_schema_is_named(check: Check, provider: Provider) -> None:
-    provider.configure(scripts={NAME: {"": "red and then blue"}})
-    (problem,) = check().problems
-    assert problem.startswith("it ignores the schema") and "json_schema: false" in problem
-
-
 def test_a_model_that_refuses_a_schema_is_asked_without_one(check: Check, provider: Provider) -> None:
     provider.configure(unstructured=[NAME])
     (problem,) = check().problems
@@ -176,11 +144,6 @@ def test_a_judge_that_thinks_inline_is_named_and_sound_once_that_is_declared(che
     (problem,) = check(JudgeEntry).problems
     assert 'say `thinking: "[THINK]"` in its entry' in problem
     assert check(JudgeEntry, thinking="[THINK]").problems == []
-
-
-def test_a_model_that_says_dots_is_named(check: Check, provider: Provider) -> None:
-    provider.configure(scripts={NAME: {"": "....."}})
-    assert any("'.....', which holds no word" in problem for problem in check().problems)
 
 
 def test_an_unknown_price_is_said(check: Check) -> None:

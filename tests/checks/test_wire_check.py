@@ -71,8 +71,9 @@ def test_the_sixteen_configurations_are_there_in_the_papers_order() -> None:
     assert [g.input for g in groups].count("image") == 5
 
 
-@pytest.mark.parametrize("name", CHECKED)
-@pytest.mark.promise
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.promise] * (name in PAPER)) for name in CHECKED]
+)
 def test_an_entry_sends_what_it_declares(name: str) -> None:
     (checked,) = check_named([name])
     assert checked.problems == []
@@ -126,14 +127,6 @@ def test_gemini_drops_a_video_url_without_a_word(monkeypatch: pytest.MonkeyPatch
     assert examine(get_model("gemini-2.5-pro")).problems == ["media: 0 of 1 videos arrive"]
 
 
-def test_gemini_is_not_told_the_rate_of_a_video_sent_as_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    def as_image_url(media: Media, _: str) -> list[dict[str, Any]]:
-        return [{"type": "image_url", "image_url": {"url": data_uris(media)[0]}}]
-
-    monkeypatch.setattr(api, "media_parts", as_image_url)
-    assert examine(get_model("gemini-2.5-pro")).problems == ["media.fps: 5 is declared, None arrives"]
-
-
 @pytest.mark.parametrize("name", ["gemini-3.1-flash-lite", "qwen3-vl-think"])
 def test_another_rate_than_the_clips_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     honest = api.media_parts
@@ -146,12 +139,6 @@ def test_another_rate_than_the_clips_is_found(name: str, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(api, "media_parts", at_one_fps)
     assert examine(get_model(name)).problems == ["media.fps: 5 is declared, 1 arrives"]
-
-
-def test_an_image_too_few_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    honest = api.media_parts
-    monkeypatch.setattr(api, "media_parts", lambda media, route: honest(media, route)[1:])
-    assert examine(get_model("gpt-5-nr")).problems == ["media: 24 of 25 images arrive"]
 
 
 def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,34 +162,9 @@ def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPa
             id="a parameter that the model refuses is not dropped silently",
         ),
         pytest.param(
-            altered("gpt-5-high", {"temperature": 0.8, "drop_params": True}),
-            "temperature: 0.8 is declared and not sent",
-            id="a parameter that the library was told to drop",
-        ),
-        pytest.param(
-            altered("gpt-5-nr", provider_id="openai/gpt-5"),
-            "max_tokens: 8000 is declared and not sent",
-            id="the wrong API's name of a parameter",
-        ),
-        pytest.param(
             altered("gemini-3.1-pro", {"temperature": None}),
             "generationConfig.temperature: 1.0 is sent and not declared",
             id="a default of the library",
-        ),
-        pytest.param(
-            altered("gemini-2.5-flash", {"thinkingConfig": None, "reasoning_effort": "high"}),
-            "generationConfig.thinkingConfig.thinkingBudget: 4096 is sent and not declared",
-            id="a setting that the library translates",
-        ),
-        pytest.param(
-            altered("gemini-3.1-pro", {"thinkingConfig": None, "reasoning_effort": "none"}),
-            'generationConfig.thinkingConfig.thinkingLevel: "low" is sent and not declared',
-            id="an effort of none that is made low",
-        ),
-        pytest.param(
-            altered("qwen3-vl-think", {"user": "me"}),
-            'user: "me" is declared and not sent',
-            id="a parameter that the library drops unasked",
         ),
         pytest.param(
             altered("qwen3-vl-think", {"note": "placeholder-of-a-key"}),

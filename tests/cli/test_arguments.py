@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import random
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from traps_pipeline.cli import build_parser, main
-from traps_pipeline.cli.run_commands import _print_problems
 
 SAMPLE = ["benchmark", "sample", "--seed", "1", "--out", "x"]
 
@@ -50,20 +47,3 @@ def test_words_of_any_kind_in_the_place_of_an_experiment_end_in_a_sentence(
         told = capsys.readouterr().err
         assert told.startswith("traps: ") and "\x1b" not in told and "\u202e" not in told
         assert len(told) < 1200
-
-
-def test_a_pipe_that_is_closed_ends_a_command_in_silence() -> None:
-    command = f"{sys.executable} -m traps_pipeline.cli results audit | head -1"
-    ran = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
-    assert ran.stderr == ""
-
-
-def test_a_cause_of_many_problems_is_printed_once_and_repeated_last(capsys: pytest.CaptureFixture[str]) -> None:
-    cause = "this machine cannot render clips"
-    _print_problems([*(f"videos/{part} is not made: {cause}" for part in ("a", "b", "c")), "items/d: is missing"])
-    assert capsys.readouterr().err.splitlines() == [
-        f"traps: videos/a is not made: {cause} (and 2 more)",
-        "traps: items/d: is missing",
-        "traps: 4 problem(s); finished work is kept: run the same command to continue",
-        f"traps: 3 of them have one cause: {cause}",
-    ]

@@ -14,21 +14,19 @@ from tests.conftest import ROOT
 from traps_pipeline.cli import GROUPS, build_parser, main
 from traps_pipeline.cli.command import SHORT
 
-COMMANDS = sorted(build_parser().commands)
 
-
-@pytest.mark.parametrize("path", COMMANDS)
-def test_the_example_of_a_help_text_can_be_given_as_it_stands(path: str) -> None:
-    text = build_parser().commands[path].format_help()
-    (example,) = (line for line in text.splitlines() if line.startswith("example: traps "))
-    parsed = build_parser().parse_args(shlex.split(example.removeprefix("example: traps ")))
-    assert parsed.parser.prog == f"traps {path}"
-    assert "exit codes: 0 done, 1 something failed, 2 bad usage, " in text
-    assert ("4 a budget is reached" in text) == (path == "study run")
+def test_the_examples_of_help_texts_can_be_given_as_they_stand() -> None:
+    for path, command in build_parser().commands.items():
+        text = command.format_help()
+        (example,) = (line for line in text.splitlines() if line.startswith("example: traps "))
+        parsed = build_parser().parse_args(shlex.split(example.removeprefix("example: traps ")))
+        assert parsed.parser.prog == f"traps {path}"
+        assert "exit codes: 0 done, 1 something failed, 2 bad usage, " in text
+        assert ("4 a budget is reached" in text) == (path == "study run")
 
 
 def test_every_command_but_completion_stands_in_a_group_and_daily_ones_need_none() -> None:
-    assert {path.split()[0] for path in COMMANDS} == {*GROUPS, "completion"}
+    assert {path.split()[0] for path in build_parser().commands} == {*GROUPS, "completion"}
     for name, group in SHORT.items():
         words = ["demo"] if name in ("plan", "run") else ["a:b:c"] if name == "why" else []
         assert build_parser().parse_args([name, *words]).parser.prog == f"traps {group} {name}"
@@ -64,23 +62,19 @@ def test_a_misspelt_word_is_bad_usage_with_the_nearest_one(
     assert hint in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("traps stu", "study"),
-        ("traps study pl", "plan"),
-        ("traps run hyp", "hypotheses hypotheses-pocket"),
-        ("traps study run demo --unt", "--until"),
-        ("traps publish ver", "verify"),
-    ],
-)
-def test_a_shell_completes_commands_options_and_experiments(words: str, expected: str) -> None:
-    script = subprocess.run(
-        [sys.executable, "-m", "traps_pipeline.cli", "completion", "bash"], cwd=ROOT, capture_output=True, text=True
-    ).stdout
-    asked = f"COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _traps; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True)
-    assert (done.stdout.strip(), done.stderr) == (expected, "")
+def test_a_shell_completes_commands_options_and_experiments() -> None:
+    command = [sys.executable, "-m", "traps_pipeline.cli", "completion", "bash"]
+    script = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for words, expected in {
+        "traps stu": "study",
+        "traps study pl": "plan",
+        "traps run hyp": "hypotheses hypotheses-pocket",
+        "traps study run demo --unt": "--until",
+        "traps publish ver": "verify",
+    }.items():
+        asked = f"COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _traps; echo ${{COMPREPLY[@]}}"
+        done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True)
+        assert (done.stdout.strip(), done.stderr) == (expected, "")
 
 
 def test_the_page_of_commands_is_what_the_parser_says_and_every_argument_has_a_meaning() -> None:
@@ -88,3 +82,12 @@ def test_the_page_of_commands_is_what_the_parser_says_and_every_argument_has_a_m
     assert PAGE.read_text(encoding="utf-8") == text  # `python -m tests.commands_page` writes it
     arguments = [line for line in text.partition("## Common")[2].splitlines() if line.startswith("- `")]
     assert len(arguments) > 100 and not [line for line in arguments if not re.search(r"`(?: \(required\))?: \w", line)]
+
+
+def test_help_loads_neither_dagster_nor_pandas() -> None:
+    code = (
+        "import sys; from traps_pipeline.cli import build_parser; build_parser().format_help();"
+        "print(sorted({'dagster', 'pandas', 'pydantic', 'numpy'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (ran.stdout, ran.stderr) == ("[]\n", "")

@@ -28,8 +28,7 @@ class Pair:
 
 def read(study: Checkout, *arguments: str) -> Any:
     """Return the JSON that a command prints."""
-    finished = study.traps(*arguments, "--json")
-    assert finished.code == 0, finished.err
+    finished = study.traps(*arguments, "--json").ok()
     return json.loads(finished.out)
 
 

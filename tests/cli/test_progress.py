@@ -10,7 +10,7 @@ import time
 import pytest
 
 from tests.terminals import Screen, read_all, terminal
-from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, Tally
 from traps_pipeline.cli.printed_progress import LiveProgress, make_progress
 
 WORDS = "a provider's words that are longer than the eighty columns of a terminal, so that they stand on two lines"
@@ -49,18 +49,6 @@ def test_a_line_has_pace_latency_failures_money_and_time_left(clock: Clock) -> N
     # 40 calls in 40 s, whose median took 2.1 s; all calls of 2 of 4 cells are made, so as long again is left
     line = "responses: 1 of 4, 1.0/s at 2.1 s, 1 errors, 1 retries, $11.00 of $50.00, 0:40 left"
     assert report.line() == line
-
-
-def test_time_left_counts_calls_of_cells_that_are_begun(clock: Clock) -> None:
-    stage = StageProgress("votes", 10)
-    report = Progress()
-    report.current_stage = stage
-    assert stage.left_s is None
-    report.asking("votes", {"judge": (10, 0)})
-    clock.now = 30.0
-    for _ in range(5):
-        report.called("judge", False, 0.1, 0.0)
-    assert stage.left_s == pytest.approx(570.0)  # half a cell of ten in 30 s
 
 
 def test_a_listener_hears_of_a_stage_every_half_minute_and_at_its_end(clock: Clock) -> None:
@@ -143,26 +131,3 @@ def test_a_terminal_has_one_region_at_its_bottom_that_leaves_nothing_behind(
     assert screen.widest <= columns
     assert screen.text.splitlines()[-1].startswith("confabulation_votes: 1 of 32 made, 1 asked")
     assert "p95" not in screen.text  # the region is gone
-
-
-def test_lines_that_are_printed_while_the_region_is_drawn_are_all_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(LiveProgress, "beat_s", 0.0005)
-    screen = Screen(80)
-    with terminal(80, 24) as (ours, theirs), os.fdopen(os.dup(theirs), "w") as stream:
-        report = make_progress("auto", stream)
-        for number in range(60):
-            report.stage(f"stage{number}", 1)
-            report.asking("", {f"model{k}": (9, 0) for k in range(number % 5)})
-            report.note(f"{number}: {WORDS}")
-            report.partition("", "", Tally(asked=1))
-            report.end_stage()
-            screen.feed(read_all(ours, wait_s=0.0))
-        report.close()
-        screen.feed(read_all(ours))
-    lines = screen.text.splitlines()
-    assert len(lines) == 3 * 60
-    for number in range(60):
-        assert lines[3 * number].startswith(f"! {number}: ")
-        assert lines[3 * number + 2].startswith(f"stage{number}: 1 of 1 made, 1 asked")

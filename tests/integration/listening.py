@@ -1,4 +1,4 @@
-"""Servers of `traps people review` and `annotate` as a test starts, asks and kills them, and a browser that watches."""
+"""Servers of `traps people review` and `annotate` as a test starts, asks and kills them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Browser, Page, sync_playwright
-
 from tests.conftest import Checkout
-from tests.foreign_page import CHROMIUM, QUIET
-from tests.pages import patient, until
 
 TOKEN = "token-of-a-reviewer-0123"
 
@@ -83,30 +78,3 @@ def listening(study: Checkout, command: str, *people: str, port: int = 0) -> Ite
     finally:
         if process.poll() is None:
             server.kill()
-
-
-@contextmanager
-def a_browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
-        yield browser
-        browser.close()
-
-
-def watched(browser: Browser, recording: Path | None = None) -> tuple[Page, list[str]]:
-    """A page of a person of their own, and what it says to the console or asks of others. recording: the file into
-    which all traffic is written when its context is closed."""
-    context = browser.new_context(
-        viewport={"width": 1280, "height": 1000}, record_har_path=recording, record_har_content="embed"
-    )
-    page, problems = patient(context.new_page()), list[str]()
-    page.on("console", lambda message: problems.append(message.text))
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    own = ("http://127.0.0.1:", "data:,", "blob:http://127.0.0.1:")  # blob: a clip that is held in memory
-    page.on("request", lambda r: None if r.url.startswith(own) else problems.append(r.url))
-    return page, problems
-
-
-def ready(page: Page) -> None:
-    """Wait until a page hears keys."""
-    until(page, "document.documentElement.dataset.ready === '1'")

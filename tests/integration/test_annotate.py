@@ -16,8 +16,8 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.conftest import EXPERIMENT, Checkout
-from tests.integration.listening import Server, a_browser, listening, ready, watched
-from tests.pages import until
+from tests.integration.listening import Server, listening
+from tests.pages import a_browser, ready, until, watched
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.people.label_units import TaskName, units
@@ -149,7 +149,7 @@ def test_two_people_label_blindly_a_kill_loses_nothing_and_the_tables_follow(stu
     never = forbidden(clips.values())
     with a_browser() as browser:
         recordings = {who: tmp_path / f"{who}.har" for who in ("jd", "ab")}
-        pages = {who: watched(browser, recording) for who, recording in recordings.items()}
+        pages = {who: watched(browser, recording=recording) for who, recording in recordings.items()}
         with listening(study, "annotate", *pages) as server:
             for who, (page, _) in pages.items():
                 page.goto(server.addresses[who])
@@ -222,8 +222,7 @@ def check_tables(study: Checkout, knowing: Knowing) -> None:
     workspace = Workspace.open(study.workspace)
     before = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
     assert before[0].startswith("people: not run") and before[1].startswith("the panel: not validated")
-    ran = study.traps("run", EXPERIMENT, "--until", "report_page")
-    assert ran.code == 0, ran.err
+    ran = study.traps("run", EXPERIMENT, "--until", "report_page").ok()
     assert ran.counts() == {"answers": 0, "votes": 0, "frames": 0}
     labels = workspace.tables.read(HUMAN_LABELS, {})
     assert len(labels) == len({(line["task"], line["unit"], line["who"]) for line in knowing.lines()})

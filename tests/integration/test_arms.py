@@ -37,8 +37,7 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     (tmp_path / "armed").mkdir()
     (study.workspace / "clips").rename(other.workspace / "clips")
     until = ("--until", "leaderboard,robust,hypotheses,graded")
-    run = other.traps("run", path, *until)
-    assert run.code == 0, run.err
+    run = other.traps("run", path, *until).ok()
     # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 2 x 2.
     # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each. A graded cut.
     assert run.counts()["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4) + 1)

@@ -71,8 +71,7 @@ with dg.DagsterInstance.get() as history, dg.build_sensor_context(history, defin
 
 
 def stale_in_dagster(study: Checkout) -> list[str]:
-    finished = study.python("-c", STALE)
-    assert finished.code == 0, finished.err
+    finished = study.python("-c", STALE).ok()
     return json.loads(finished.out.splitlines()[-1])
 
 
@@ -83,10 +82,9 @@ def cells(*datasets: str) -> list[str]:
 
 def materialize(study: Checkout, stage: str, *keys: str) -> None:
     for key in keys:
-        finished = study.dagster(
+        study.dagster(
             *("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage, "--partition", key)
-        )
-        assert finished.code == 0, finished.err[-3000:]
+        ).ok()
 
 
 @pytest.mark.promise
@@ -94,8 +92,7 @@ def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> 
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
     why = study.traps("why", "chaotic_ill_posed:plinko-0002:void").out
     assert why.count("still stands") == EVALUATIONS  # nothing is made from the correction yet
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
+    run = study.score(EXPERIMENT).ok()
     assert run.counts() == {"answers": EVALUATIONS, "votes": 3 * EVALUATIONS, "frames": 0}
     # Versions change where the correction reaches, and nowhere else.
     tables = Workspace.open(study.workspace).tables
@@ -140,22 +137,13 @@ def test_a_deleted_table_fails_its_check_within_a_tick_of_the_sensor(study: Chec
     assert latest.out.split() == ["FAILED", "chaotic|prior__json__run1"], latest.err
 
 
-def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Checkout) -> None:
-    materialize(study, "scene_specs", "hidden")
-    materialize(study, "items", "occlusion")
-    materialize(study, "responses", "occlusion|oracle__standard__run1")
-    assert stale_in_dagster(study) == []
-    assert study.traps("status", EXPERIMENT).out.endswith(" stages are fresh\n")
-
-
 @pytest.mark.promise
 def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> None:
     clips = study.workspace / "clips"
     before = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
     azimuth = json.loads(_released(study, "domino_chain-0002"))["params"]["azimuth_deg"]
     study.correct("domino_chain-0002", params={"azimuth_deg": azimuth + 2.0})
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
+    run = study.score(EXPERIMENT).ok()
     # Both items of `occlusion` and both of `occlusion_ill_posed` show new clips. Judges see no clip: a vote is asked
     # again only where the new answer reads otherwise, which is so for the random strategy at most.
     counts = run.counts()
@@ -174,8 +162,7 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
 def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Checkout) -> None:
     rows = study.ledger_rows("answers")
     study.correct("tumbling_dice-0003", action="discard")
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
+    run = study.score(EXPERIMENT).ok()
     assert run.counts()["frames"] == 0
     before = {row["key"] for row in rows}
     asked = [row for row in study.ledger_rows("answers") if row["key"] not in before]
@@ -223,8 +210,7 @@ def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gon
     latest = whole.python("-c", LATEST, "videos", "clips_distinct")
     assert latest.out.split() == ["FAILED", "hidden"], latest.err
     study.correct("hidden_race-9001", params={"azimuth_deg": params["azimuth_deg"] + 3.0})
-    run = whole.traps("run", tmp_path / "whole.yaml", "--until", "responses")
-    assert run.code == 0, run.err
+    run = whole.traps("run", tmp_path / "whole.yaml", "--until", "responses").ok()
     assert run.counts()["frames"] == 150
 
 

@@ -46,8 +46,7 @@ def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_m
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         assert rows_written(unasked, kind) < all_of_them  # killed in the middle, not after the end
-    finished = unasked.score(ONE_REGIME)
-    assert finished.code == 0, finished.err
+    unasked.score(ONE_REGIME).ok()
     for kind, wanted in (("answers", ANSWERS), ("votes", VOTES)):
         keys = [row["key"] for row in unasked.ledger_rows(kind)]
         assert len(keys) == len(set(keys)) == wanted
@@ -73,8 +72,7 @@ def test_a_history_that_cannot_be_written_in_mid_evaluation_ends_the_run_and_los
         database.execute("DROP TRIGGER full")
         database.commit()
     assert 0 < rows_written(unasked, "answers") < ANSWERS
-    finished = unasked.score(ONE_REGIME)
-    assert finished.code == 0, finished.err
+    unasked.score(ONE_REGIME).ok()
     keys = [row["key"] for row in unasked.ledger_rows("answers")]
     assert len(keys) == len(set(keys)) == ANSWERS
     assert_same_tables(unasked.workspace, one_regime.workspace)
@@ -112,8 +110,7 @@ def test_a_kill_while_rendering_leaves_whole_clips_that_are_not_drawn_again(stud
     time.sleep(1.5)  # a worker looks for its parent every second
     done = len(list((study.workspace / "clips").glob("domino_chain-000[123]/*.json")))
     assert 0 < done < 9
-    finished = study.score(EXPERIMENT)
-    assert finished.code == 0, finished.err
+    finished = study.score(EXPERIMENT).ok()
     assert finished.counts()["frames"] == 50 * (9 - done)
     assert sorted(
         path for path in (study.workspace / "clips").glob("domino_chain-000[123]/*") if "part" not in path.name
@@ -128,7 +125,6 @@ def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regim
     assert process.returncode == 130, err
     assert "interrupted" in err and "Traceback" not in err
     assert 100 <= rows_written(unasked, "answers") < ANSWERS
-    finished = unasked.score(ONE_REGIME)
-    assert finished.code == 0, finished.err
+    unasked.score(ONE_REGIME).ok()
     assert len(unasked.ledger_rows("answers")) == ANSWERS
     assert_same_tables(unasked.workspace, one_regime.workspace)

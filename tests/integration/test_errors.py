@@ -34,8 +34,7 @@ def test_a_damaged_row_of_the_ledger_is_named_and_its_answer_alone_asked_again(s
         opened.commit()
     for table in (study.workspace / "tables" / "responses").glob("*/oracle/json/*.parquet"):
         table.unlink()
-    finished = study.score(EXPERIMENT)
-    assert finished.code == 0, finished.err
+    finished = study.score(EXPERIMENT).ok()
     assert f"{path}: row {row}: not what was written: it is not believed; its answer is asked again" in finished.err
     assert finished.counts()["answers"] == 1
 

@@ -6,7 +6,6 @@ import functools
 import http.server
 import re
 import shutil
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,13 +14,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 from scipy.stats import binomtest
 
 from tests.build.cells import row, write_cell
 from tests.conftest import Checkout
-from tests.foreign_page import CHROMIUM, QUIET
-from tests.pages import patient, until
+from tests.pages import patient, until, watched
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.report.explorer.site import write_site
@@ -34,7 +32,10 @@ from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-FIGURES = {"pecs": fraction, "acc": percent, "abs_rec": percent, "false_abs": percent, "j": fraction}
+FIGURES = {
+    "PECS": ("pecs", fraction), "Acc %": ("acc", percent), "AbsRec %": ("abs_rec", percent),
+    "FalseAbs %": ("false_abs", percent), "J": ("j", fraction),
+}  # fmt: skip
 # Markup, LaTeX, a right-to-left override, a zero-width space, a byte-order mark and a tag character.
 HOSTILE = (
     '<script>parent.document.title="owned"</script><img src="http://evil.example/x.png" onerror="alert(1)"> '
@@ -81,33 +82,19 @@ class Visit:
 def site(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Site:
     """The site of the small study, written by the command, then moved: nothing in it names where it was made."""
     made, folder = tmp_path_factory.mktemp("made") / "site", tmp_path_factory.mktemp("moved") / "site"
-    finished = small.traps("site", made)
-    assert finished.code == 0, finished.err
+    finished = small.traps("site", made).ok()
     assert str(made / "index.html") in finished.out
     shutil.move(made, folder)
     return Site(folder, Workspace.open(small.workspace))
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
-        yield browser
-        browser.close()
-
-
 @contextmanager
 def visit(browser: Browser, address: str, width: int = 1280) -> Iterator[Visit]:
     """A new page at an address; at the end it must have said nothing and asked for nothing outside."""
-    page = patient(browser.new_page(viewport={"width": width, "height": 900}))
-    problems: list[str] = []
     inside = address.rpartition("/")[0], "data:,", "blob:"  # a clip that is held in memory
-    page.on("console", lambda message: problems.append(message.text))
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("dialog", lambda dialog: problems.append(dialog.message))
-    page.on("request", lambda r: None if r.url.startswith(inside) else problems.append(r.url))
+    page, problems = watched(browser, width, inside)
     yield Visit(page, address, problems)
-    page.close()
+    page.context.close()
     assert problems == []
 
 
@@ -127,10 +114,15 @@ def hosted(folder: Path) -> Iterator[str]:
         server.shutdown()
 
 
-def cells(page: Page, name: str) -> list[list[str]]:
-    """The texts of a table's rows."""
-    script = "rows => rows.map(row => [...row.children].map(cell => cell.innerText.trim()))"
-    return page.locator(f"table[data-name={name}] tbody tr").evaluate_all(script)
+def by_heading(page: Page, name: str) -> list[dict[str, str]]:
+    """The texts of a table's rows by the headings of their columns."""
+    script = """table => {
+        const text = cell => cell.innerText.replace(/ [▾▴]$/, "").trim();
+        const headings = [...table.tHead.rows[0].cells].map(text);
+        return [...table.tBodies[0].rows].map(
+            row => Object.fromEntries([...row.cells].map((cell, k) => [headings[k], text(cell)])));
+    }"""
+    return page.locator(f"table[data-name={name}]").evaluate(script)
 
 
 @pytest.mark.promise
@@ -140,22 +132,24 @@ def test_every_leaderboard_figure_is_that_of_the_table(site: Site, browser: Brow
     with visit(browser, site.address) as visited:
         for dataset in board["dataset"].unique():
             page = visited.go(f"#/?dataset={dataset}")
-            shown = {(line[0], line[1]): line for line in cells(page, "leaderboard")}
+            shown = {(line["Model"], line["Regime"]): line for line in by_heading(page, "leaderboard")}
             rows = board.loc[board["dataset"] == dataset].to_dict("records")
             assert len(shown) == len(rows)
             for wanted in rows:
                 line = shown[wanted["model"], wanted["regime"]]
-                for place, (name, printed) in enumerate(FIGURES.items(), start=2):
+                for heading, (name, printed) in FIGURES.items():
                     low, high = (printed(wanted[f"{name}_ci_{end}"]) for end in ("low", "high"))
-                    assert line[place].split("\n") == [printed(wanted[name]), f"[{low}, {high}]"], (wanted, name)
+                    assert line[heading].split("\n") == [printed(wanted[name]), f"[{low}, {high}]"], (wanted, name)
                     compared += 3
                 low, high = wanted["rank_low"], wanted["rank_high"]
-                assert line[7] == (f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}")
-                assert line[8:] == [str(wanted["n_pairs"]), str(wanted["n_runs"]), str(wanted["n_missing"])]
+                assert line["Rank"] == (f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}")
+                for heading, name in (("n", "n_pairs"), ("Runs", "n_runs"), ("Missing", "n_missing")):
+                    assert line[heading] == str(wanted[name])
         # The order by PECS is the report's own.
         (ranked, *_) = leaderboards(board)
         page = visited.go("#/")
-        assert [line[:2] for line in cells(page, "leaderboard")] == [line[:2] for line in ranked.cells]
+        order = [(line["Model"], line["Regime"]) for line in by_heading(page, "leaderboard")]
+        assert order == [*zip(ranked.rows["model"], ranked.rows["regime"], strict=True)]
     assert compared == 3 * len(FIGURES) * len(board) == 450
 
 
@@ -164,14 +158,14 @@ def test_the_paper_stands_beside_the_study_and_what_was_not_run_says_so(site: Si
     published = published.loc[published["dataset"] == "chaotic"].set_index(["model", "regime"])
     with visit(browser, site.address) as visited:
         page = visited.go("#/?dataset=chaotic&paper=1")
-        lines = {(line[0], line[1]): line for line in cells(page, "leaderboard")}
+        lines = {(line["Model"], line["Regime"]): line for line in by_heading(page, "leaderboard")}
         assert len(lines) == 6 + len(published)
         for key, paper in published.iterrows():
-            line = lines[key]
-            assert line[2:7] == ["not run"] * 5
-            wanted = [fraction(paper["pecs"]), *(percent(paper[name]) for name in ("acc", "abs_rec", "false_abs"))]
-            assert line[8:12] == wanted
-        assert lines["oracle", "json"][8:12] == ["–"] * 4
+            for heading, (name, printed) in FIGURES.items():
+                assert lines[key][heading] == "not run"
+                if name != "j":
+                    assert lines[key][f"Paper: {heading}"] == printed(paper[name])
+        assert lines["oracle", "json"]["Paper: PECS"] == "–"
         assert "This study did not ask it" in visited.go("#/model/gpt-5-pro").inner_text("main")
 
 
@@ -198,7 +192,7 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
     differences = site.workspace.tables.read(CONTRASTS, {})
 
     def counted(page: Page) -> tuple[list[int], str]:
-        numbers = [int(text) for line in cells(page, "counts") for text in line[1:]]
+        numbers = [int(text) for line in by_heading(page, "counts") for text in [*line.values()][1:]]
         return numbers, page.locator("[data-field=p]").inner_text().removeprefix("p ").removeprefix("= ")
 
     def printed(p: float) -> str:
@@ -224,11 +218,10 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
         assert p == printed(binomtest(only[0], sum(only), 0.5).pvalue)
         key = ["kind", "dataset", "figure", "left_model", "left_regime", "right_model"]
         found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"]
-        line = next(line for line in cells(page, "differences") if line[:2] == ["Chaotic", "PECS"])
-        assert line[2:4] == [
-            fraction(found["difference"]),
-            f"[{fraction(found['ci_low'])}, {fraction(found['ci_high'])}]",
-        ]
+        lines = {(line["Dataset"], line["Figure"]): line for line in by_heading(page, "differences")}
+        assert lines["Chaotic", "PECS"]["Difference"] == fraction(found["difference"])
+        interval = f"[{fraction(found['ci_low'])}, {fraction(found['ci_high'])}]"
+        assert lines["Chaotic", "PECS"]["95 % interval"] == interval
         listed = page.locator("ul.pairs").first.locator("a").all_inner_texts()
         assert sorted(listed) == sorted(item.split(":")[1] for item in by.index[left & ~right])
 
@@ -335,32 +328,6 @@ def test_no_view_is_wider_than_the_screen(site: Site, browser: Browser, width: i
             assert page.evaluate("document.querySelectorAll('h1').length") == 1
 
 
-def test_the_landscape_has_a_point_with_its_intervals_for_each_row_of_the_table(site: Site, browser: Browser) -> None:
-    board = site.workspace.tables.read(LEADERBOARD, {})
-    rows = board.loc[(board["dataset"] == "chaotic") & (board["regime"] == "standard")].set_index("model")
-    with visit(browser, site.address) as visited:
-        page = visited.go("#/landscape?dataset=chaotic&regime=standard")
-        points = page.locator(".plane .point")
-        assert points.count() == len(rows) == 3
-        for place in range(3):
-            point = points.nth(place)
-            row = rows.loc[str(point.get_attribute("aria-label"))]
-            at = [float(str(point.locator("circle").get_attribute(name))) for name in ("cx", "cy")]
-            assert at == pytest.approx([x_of(page, row["j"]), 14 + (1 - row["acc"]) * (520 - 14 - 44)], abs=0.01)
-            across = point.locator(".interval-bar").first
-            ends = [float(str(across.get_attribute(name))) for name in ("x1", "x2")]
-            low, high = max(-1, row["j_ci_low"]), min(1, row["j_ci_high"])
-            assert ends == pytest.approx([x_of(page, low), x_of(page, high)], abs=0.01)
-        points.first.locator("text").click()
-        page.wait_for_url(re.compile(r"#/model/"))
-
-
-def x_of(page: Page, j: float) -> float:
-    """Where a value of J stands on the plane, from the positions of 0 and 1."""
-    zero = float(str(page.locator(".plane .axis").get_attribute("x1")))
-    return zero + j * (620 - zero)
-
-
 def test_a_view_is_taken_along_as_a_table_or_as_an_address(site: Site, browser: Browser, tmp_path: Path) -> None:
     board = site.workspace.tables.read(LEADERBOARD, {})
     with visit(browser, site.address) as visited:
@@ -451,10 +418,3 @@ def test_what_was_not_run_or_cannot_be_read_says_so(browser: Browser, tmp_path: 
     page.wait_for_selector("[role=alert]")
     assert "items.js cannot be read: copy the whole folder" in page.inner_text("main")
     page.close()
-
-
-def test_the_command_names_its_folder_and_refuses_another(small: Checkout, tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    finished = small.run(sys.executable, "-m", "traps_pipeline.cli", "site", tmp_path)
-    assert finished.code == 1
-    assert f"{tmp_path}: holds something that is no site" in finished.err

@@ -56,8 +56,7 @@ class Campaign:
         return call, draw.randint(1, self.calls[call])
 
     def assert_whole(self) -> None:
-        finished = self.study.traps(*self.command)
-        assert finished.code == 0, finished.err
+        self.study.traps(*self.command).ok()
         for kind in ("answers", "votes"):
             found, wanted = keys(self.study.workspace, kind), keys(self.undisturbed, kind)
             assert len(found) == len(set(found))
@@ -128,8 +127,7 @@ def begun(
         pytest.skip("strace is not installed (make campaign installs it)")
     start(study)
     log = study.root / "calls"
-    finished = traced(study, command, log)
-    assert finished.code == 0, finished.err
+    traced(study, command, log).ok()
     found = Counter(re.findall(r"^(\d+) +(\w+)\(", log.read_text(), re.MULTILINE))
     calls = {call: max(n for (_, name), n in found.items() if name == call) for call in {name for _, name in found}}
     if not undisturbed.exists():

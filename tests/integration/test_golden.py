@@ -45,8 +45,7 @@ def test_every_table_that_was_made_knows_its_benchmark_version(small: Checkout) 
 
 
 def test_a_second_run_does_nothing_and_status_and_plan_agree(study: Checkout) -> None:
-    again = study.traps("run", EXPERIMENT)
-    assert again.code == 0, again.err
+    again = study.traps("run", EXPERIMENT).ok()
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "tables and figures" not in again.err  # no partition was materialized
     place, fresh = study.traps("status", EXPERIMENT).out.splitlines()

@@ -24,8 +24,7 @@ EXECUTE = ("job", "execute", "-m", "traps_pipeline.definitions", "-j")
 def empty(tmp_path: Path) -> Checkout:
     """A study with an arm of which nothing is made."""
     study = Checkout(ROOT, tmp_path / "study")
-    initialized = study.traps("init", "tests/experiments/with_arm.yaml")
-    assert initialized.code == 0, initialized.err
+    study.traps("init", "tests/experiments/with_arm.yaml").ok()
     return study
 
 

@@ -52,8 +52,7 @@ def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_
     assert study.traps("run", experiment, "--until", "videos").code == 0
 
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    finished = study.traps("run", experiment, "--until", "responses")
-    assert finished.code == 0, finished.err
+    study.traps("run", experiment, "--until", "responses").ok()
 
 
 def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> None:

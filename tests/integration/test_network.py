@@ -49,8 +49,7 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
     runs = [1, 2, 3] if MANY else [1]
     path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=runs)
-    finished = ask(unasked, path, "--budget-usd", "500")
-    assert finished.code == 0, finished.err
+    finished = ask(unasked, path, "--budget-usd", "500").ok()
     rows, stats = responses(unasked), provider.stats()
     assert (
         len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * ITEMS * 3 * len(runs)
@@ -96,8 +95,7 @@ def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Pro
     again = ask(unasked, path)  # spend survives restarts
     assert again.code == 4
     assert sum(row["cost_usd"] for row in settled(unasked)) <= 0.4
-    more = ask(unasked, path, "--budget-usd", "100")
-    assert more.code == 0, more.err
+    ask(unasked, path, "--budget-usd", "100").ok()
     assert provider.stats()["answered_in_full"] == len(settled(unasked)) == 2 * ITEMS
 
 
@@ -196,8 +194,7 @@ def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider:
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-    finished = ask(unasked, path)
-    assert finished.code == 0, finished.err
+    ask(unasked, path).ok()
     rows = settled(unasked)
     assert len(rows) == len({row["key"] for row in rows}) == wanted
     sent = provider.stats()["answered_in_full"]
@@ -241,8 +238,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
     path = experiment(unasked, ["video-model", "image-model"], regimes=["standard"], datasets=["occlusion"])
-    exported = unasked.traps("study", "export-requests", path, "--out", tmp_path / "batch")
-    assert exported.code == 0, exported.err
+    unasked.traps("study", "export-requests", path, "--out", tmp_path / "batch").ok()
     lines = [json.loads(line) for line in (tmp_path / "batch" / "requests.jsonl").read_text().splitlines()]
     assert len(lines) == len({line["key"] for line in lines}) == 24
     for line in lines:
@@ -276,8 +272,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     assert "1 answers imported, 19 were there already" in unasked.traps("study", "import-answers", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
     assert "4 answers imported, 20 were there already" in unasked.traps("study", "import-answers", path, given).out
-    finished = ask(unasked, path)
-    assert finished.code == 0, finished.err
+    finished = ask(unasked, path).ok()
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0
     assert Counter(row["outcome"] for row in responses(unasked)) == {"answer": 23, "refused": 1}

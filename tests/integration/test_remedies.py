@@ -14,16 +14,9 @@ import pytest
 from tests.build.studies import assert_same_tables
 from tests.conftest import EXPERIMENT, Checkout, Finished
 
-
-def edit_record(study: Checkout, file: str, line: int, **changes: object) -> Path:
-    path = study.root / "scene_specs" / "released" / f"{file}.jsonl"
-    lines = path.read_text().splitlines()
-    lines[line - 1] = json.dumps(json.loads(lines[line - 1]) | changes)
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 pytestmark = pytest.mark.slow
+CELL = "occlusion|oracle__json__run1"
+FILE = "occlusion/oracle/json/1.parquet"
 
 
 @pytest.fixture
@@ -32,53 +25,26 @@ def study(own_study: Checkout) -> Checkout:
     return own_study
 
 
-CELL = "occlusion|oracle__json__run1"
-FILE = "occlusion/oracle/json/1.parquet"
-
-
-def released(study: Checkout) -> Path:
-    return study.root / "scene_specs" / "released"
-
-
 def halve(path: Path) -> Path:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return path
 
 
 def cut_record(study: Checkout) -> Path:
-    path = released(study) / "plinko.jsonl"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([lines[0], lines[1][:50], *lines[2:]]) + "\n")
+    path = study.root / "scene_specs" / "released" / "plinko.jsonl"
+    first, second, *others = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([first, second[:50] + "\n", *others]))
     return path
-
-
-def doubled_record(study: Checkout) -> Path:
-    path = released(study) / "plinko.jsonl"
-    path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
-    return path
-
-
-def without_last_line(path: Path) -> None:
-    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
 
 
 def swapped_trajectory(study: Checkout) -> Path:
-    edit_record(study, "plinko", 1, ill_posed_question="How heavy is the moon in the picture?")  # is read again
-    path = released(study) / "trajectories" / "plinko-0001.npz"
+    """The trajectory of another scene, beside a record that was edited, so that it is read again."""
+    released = study.root / "scene_specs" / "released"
+    first, *others = (released / "plinko.jsonl").read_text().splitlines(keepends=True)
+    edited = json.loads(first) | {"ill_posed_question": "How heavy is the moon in the picture?"}
+    (released / "plinko.jsonl").write_text("".join([json.dumps(edited) + "\n", *others]))
+    path = released / "trajectories" / "plinko-0001.npz"
     shutil.copy(path.with_name("plinko-0002.npz"), path)
-    return path
-
-
-def empty_prompt(study: Checkout) -> Path:
-    path = study.root / "assets" / "prompts" / "json_suffix.txt"
-    path.write_text("")
-    return path
-
-
-def altered_note(study: Checkout) -> Path:
-    path = next((study.workspace / "clips" / "hidden_race-0001").glob("void-*.json"))
-    path.write_text(path.read_text().replace("1", "2", 1))
-    shutil.rmtree(study.workspace / "tables" / "videos")  # so that clips and their notes are looked at
     return path
 
 
@@ -92,8 +58,7 @@ def wrong_correction(study: Checkout) -> Path:
 
 
 def restored(study: Checkout, path: Path, kept: Path) -> None:
-    for folder in ("scene_specs", "assets"):
-        shutil.copytree(kept / folder, study.root / folder, dirs_exist_ok=True)
+    shutil.copytree(kept, study.root / "scene_specs", dirs_exist_ok=True)
 
 
 def renamed(study: Checkout, path: Path, kept: Path) -> None:
@@ -103,18 +68,14 @@ def renamed(study: Checkout, path: Path, kept: Path) -> None:
 # What is done to a study, and what the error then says to do with the file that it names.
 FAULTS: dict[str, tuple[Callable[[Checkout], Path], Callable[[Checkout, Path, Path], object]]] = {
     "a record cut short": (cut_record, restored),
-    "a record that occurs twice": (doubled_record, lambda study, path, kept: without_last_line(path)),
     "another scene's trajectory": (swapped_trajectory, restored),
-    "an empty prompt": (empty_prompt, restored),
-    "an altered note of a clip": (altered_note, lambda study, path, kept: path.unlink()),
     "half of a clip": (halved_clip, lambda study, path, kept: path.unlink()),
     "a correction of no scene": (wrong_correction, renamed),
 }
 
 
 def test_each_remedy_for_a_file_lets_the_same_command_go_on(study: Checkout, small: Checkout, tmp_path: Path) -> None:
-    for folder in ("scene_specs", "assets"):
-        shutil.copytree(study.root / folder, tmp_path / "kept" / folder)
+    shutil.copytree(study.root / "scene_specs", tmp_path / "kept")
     for name, (damaged, remedy) in FAULTS.items():
         path = damaged(study)
         finished = study.score(EXPERIMENT)

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.conftest import Checkout
-from tests.foreign_page import CHROMIUM, QUIET
-from tests.pages import patient, until
+from tests.pages import until, watched
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
-        yield browser
-        browser.close()
-
-
 def opened(browser: Browser, file: Path, width: int) -> tuple[Page, list[str]]:
     """A page of that width, and where its console messages and requests that leave the machine are collected."""
-    page, problems = patient(browser.new_page(viewport={"width": width, "height": 1000})), list[str]()
-    page.on("console", lambda message: problems.append(message.text))
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("request", lambda r: None if r.url.startswith(("file:", "data:")) else problems.append(r.url))
+    page, problems = watched(browser, width, ("file:", "data:"))
     page.goto(file.as_uri())
     return page, problems
 

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.conftest import EXPERIMENT, Checkout
-from tests.integration.listening import a_browser, listening, ready, watched
-from tests.pages import until
+from tests.integration.listening import listening
+from tests.pages import a_browser, ready, until, watched
 
 pytestmark = pytest.mark.slow
 
@@ -118,8 +118,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
     ]
     assert lines[5]["scenario_id"] == sixth and lines[5]["question"] == "What happens, in your words?"
     assert lines[6]["scenario_id"] == seventh and lines[6]["ill_posed_question"] == ILL_POSED
-    ran = study.score(EXPERIMENT)
-    assert ran.code == 0, ran.err
+    ran = study.score(EXPERIMENT).ok()
     answers = 4 * 3 * 2  # four items, three models, two regimes
     counts = ran.counts()
     assert (counts["answers"], counts["frames"]) == (answers, 0)

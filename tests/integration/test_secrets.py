@@ -19,25 +19,14 @@ from tests.conftest import KEY, ROOT, Checkout, Finished
 pytestmark = pytest.mark.slow
 
 CORE = "sk-pL4nt3dQz93XwJk20vB"
+# tests/base/test_keys.py has every form that is refused, tests/base/test_redaction.py every form that is blanked.
 REFUSED = {
     "line break": f"{CORE}\n",
-    "carriage return": f"{CORE}\r",
-    "space after": f"{CORE} ",
-    "space before": f" {CORE}",
-    "tab": f"{CORE[:9]}\t{CORE[9:]}",
     "control character": f"{CORE}\x1b",
-    "not ASCII": f"{CORE}ä",
     "no Unicode": f"{CORE}\udce4",
-    "two lines": f"{CORE}\n{CORE[::-1]}",
     "quotes": f'"{CORE}"',
 }
-TAKEN = {
-    "plain": CORE,
-    "quotes and dollars": f"{CORE}'$\"`",
-    "percent signs": f"%41{CORE}%25%",
-    "base64": b64encode(CORE.encode()).decode(),
-    "very long": CORE * 150,
-}
+TAKEN = {"plain": CORE, "quotes and dollars": f"{CORE}'$\"`", "percent signs": f"%41{CORE}%25%"}
 KINDS = ("refusal", "server-error", "answer", "odd")  # models of the server, by what they do
 MATERIALIZE = "asset materialize -m traps_pipeline.definitions --select responses --partition"
 COMMANDS = (
@@ -128,8 +117,7 @@ def tried(address: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Check
     }
     (folder / "echo.yaml").write_text(yaml.safe_dump(experiment))
     checkout = Checkout(ROOT, folder / "study")
-    made = checkout.traps("run", folder / "echo.yaml", "--until", "items")
-    assert made.code == 0, made.err
+    checkout.traps("run", folder / "echo.yaml", "--until", "items").ok()
     commands = [command.format(experiment=folder / "echo.yaml", out=folder / "out") for command in COMMANDS]
     (folder / "keys").write_text(repr((commands, KEY, REFUSED | TAKEN)))
     return checkout, checkout.python("-c", SCRIPT, folder / "keys")

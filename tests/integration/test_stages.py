@@ -8,13 +8,11 @@ import shutil
 import sys
 from pathlib import Path
 
-import pandas as pd
 import pytest
 import yaml
 
-from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers, forget_rows
-from traps_pipeline.judging import panel
-from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
+from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.scoring.score_rows import METRICS
@@ -41,8 +39,7 @@ print(json.dumps({
 
 
 def known(study: Checkout) -> dict:
-    finished = study.python("-c", VERSIONS)
-    assert finished.code == 0, finished.err
+    finished = study.python("-c", VERSIONS).ok()
     return json.loads(finished.out.splitlines()[-1])
 
 
@@ -61,66 +58,37 @@ def test_stages_that_share_partitions_are_made_together_from_the_tables_that_are
         ("items,metrics", "occlusion"),
         ("responses,votes,verdicts", CELL),
     ):
-        finished = materialize(study, stages, "--partition", key)
-        assert finished.code == 0, (stages, finished.err[-3000:])
-    finished = materialize(study, ",".join(before["whole"]))
-    assert finished.code == 0, finished.err[-3000:]
+        materialize(study, stages, "--partition", key).ok()
+    materialize(study, ",".join(before["whole"])).ok()
     assert known(study) == before  # rebuilt from the same inputs: the same content
-
-
-def test_votes_of_a_large_cell_are_collected_in_parts_and_are_the_same_table(
-    study: Checkout, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first cell is known to the ledger, the second is asked again; 5 answers a part, and fewer in the last."""
-    workspace, cells = Workspace.open(study.workspace), [Cell.parse(key) for key in RANGE.split("...")]
-    before = [workspace.tables.read(VOTES, cell.partition) for cell in cells]
-    forget_rows(study, "votes", cells[1].evaluation.key)
-    monkeypatch.setattr(panel, "PART", 5)
-    made = dict(panel.collect_votes(workspace, cells))
-    for cell, rows in zip(cells, before, strict=True):
-        wanted = len(rows)
-        assert made[cell].shown["wanted"] == wanted > 3 * 5
-        assert (made[cell].tally.asked, made[cell].tally.cached) == ((0, wanted) if cell == cells[0] else (wanted, 0))
-        workspace.tables.write(VOTES, cell.partition, made[cell].rows(VOTES), {})
-        again = workspace.tables.read(VOTES, cell.partition)
-        pd.testing.assert_frame_equal(again.drop(columns="created_at"), rows.drop(columns="created_at"))
 
 
 @pytest.mark.promise
 def test_a_range_of_cells_is_one_run_through_three_stages_and_makes_exactly_its_cells(study: Checkout) -> None:
     forget_answers(study)
-    finished = materialize(study, "responses,votes,verdicts", "--partition-range", RANGE)
-    assert finished.code == 0, finished.err[-3000:]
+    materialize(study, "responses,votes,verdicts", "--partition-range", RANGE).ok()
     for stage in ("responses", "votes", "verdicts"):
         assert len([*(study.workspace / "tables" / stage).rglob("*.parquet")]) == 2 * 2  # datasets x regimes
     assert len(study.ledger_rows("answers")) == 2 * 2 * 12
-    finished = materialize(study, "metrics", "--partition-range", "occlusion...occlusion_ill_posed")
-    assert finished.code == 0, finished.err[-3000:]
+    materialize(study, "metrics", "--partition-range", "occlusion...occlusion_ill_posed").ok()
 
 
 def test_one_command_makes_all_that_the_study_asks_and_fails_with_what_it_could_not(own_study: Checkout) -> None:
     before = known(own_study)["versions"]
     forget_answers(own_study)
-    finished = execute(own_study, "everything")
-    assert finished.code == 0, finished.err[-3000:]
+    execute(own_study, "everything").ok()
     assert known(own_study)["versions"] == before
     question = {"ill_posed_question": "What does the triangle at the bottom weigh?"}
     own_study.correct("plinko-0002", **question)
     asked = len(own_study.ledger_rows("answers"))
     assert execute(own_study, "everything").code == 0  # a correction is one command
     assert len(own_study.ledger_rows("answers")) == asked + 3 * 2
-    damaged = Workspace.open(own_study.workspace).tables.path(VERDICTS, {**_partition(CELL)})
+    damaged = Workspace.open(own_study.workspace).tables.path(VERDICTS, Cell.parse(CELL).partition)
     (own_study.root / "scene_specs" / "released" / "plinko.jsonl").write_text("{}\n")
     damaged.unlink()
     finished = execute(own_study, "everything")
     assert finished.code == 1
     assert "plinko.jsonl:1" in finished.out + finished.err
-
-
-def _partition(cell: str) -> dict[str, str | int]:
-    from traps_pipeline.protocol.cells import Cell
-
-    return Cell.parse(cell).partition
 
 
 def test_a_stopped_model_leaves_the_other_cells_made_and_the_reason_is_told(study: Checkout) -> None:
@@ -150,8 +118,7 @@ def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(own_s
     status = own_study.traps("status", EXPERIMENT).out
     version = re.search(rf"its code has version (\w+) now, it was made by version {old}\b", status)
     assert version is not None and version[1] != old, status
-    run = own_study.score(EXPERIMENT)
-    assert run.code == 0, run.err
+    run = own_study.score(EXPERIMENT).ok()
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert Workspace.open(own_study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == version[1]
 
@@ -168,8 +135,7 @@ def test_an_altered_table_is_named_and_made_again(study: Checkout) -> None:
     refused = materialize(study, "leaderboard")
     assert refused.code == 1
     assert "metrics/chaotic" in refused.out + refused.err and "it was altered" in refused.out + refused.err
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
+    study.score(EXPERIMENT).ok()
     assert "it was altered" not in study.traps("status", EXPERIMENT).out
 
 
@@ -182,8 +148,7 @@ def test_a_copied_study_and_two_studies_in_one_history_do_each_other_no_harm(stu
     shutil.copytree(study.workspace / "clips", other.workspace / "clips")
     shared = f"DAGSTER_HOME={study.workspace / 'dagster'}"
     traps = ["env", shared, sys.executable, "-m", "traps_pipeline.cli"]
-    made = other.run(*traps, "run", EXPERIMENT, "--until", "items")
-    assert made.code == 0, made.err
+    other.run(*traps, "run", EXPERIMENT, "--until", "items").ok()
     assert len(Workspace.open(other.workspace).tables.read_all(ITEMS)) == 48
     again = study.score(EXPERIMENT)  # the first study finds its own history as it was
     assert again.code == 0 and "tables and figures" not in again.err, again.err
@@ -202,8 +167,7 @@ with dg.DagsterInstance.get() as history:
         history.report_engine_event("begun", run)
         history.handle_run_event(run.run_id, dg.DagsterEvent(dg.DagsterEventType.RUN_START.value, job.name))
 """
-    begun = study.python("-c", code)
-    assert begun.code == 0, begun.err
+    study.python("-c", code).ok()
     assert study.traps("run", EXPERIMENT, "--until", "items").code == 0
     states = """
 import dagster as dg
@@ -230,26 +194,14 @@ def test_a_failing_step_exits_with_one_and_names_the_file(own_study: Checkout) -
 def test_a_table_that_was_deleted_is_made_again_from_the_ledger(study: Checkout) -> None:
     shutil.rmtree(study.workspace / "tables" / "responses")
     shutil.rmtree(study.workspace / "tables" / "verdicts")
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
+    run = study.score(EXPERIMENT).ok()
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
 
 
-@pytest.mark.promise
 def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) -> None:
     heavy = ("torch", "transformers", "litellm", "mujoco", "matplotlib", "cv2", "sklearn", "av", "pandas")
     code = f"import traps_pipeline.definitions, sys; print([m for m in {heavy} if m in sys.modules])"
     finished = study.run(sys.executable, "-c", code)
     assert finished.out.strip() == "[]", finished.err
-    valid = study.dagster("definitions", "validate", "-m", "traps_pipeline.definitions")
-    assert valid.code == 0, valid.err
+    valid = study.dagster("definitions", "validate", "-m", "traps_pipeline.definitions").ok()
     assert "BetaWarning" not in valid.err
-
-
-@pytest.mark.promise
-def test_help_loads_neither_dagster_nor_pandas(study: Checkout) -> None:
-    code = (
-        "import sys; from traps_pipeline.cli import build_parser; build_parser().format_help();"
-        "print(sorted({'dagster', 'pandas', 'pydantic', 'numpy'} & set(sys.modules)))"
-    )
-    assert study.run(sys.executable, "-c", code).out.strip() == "[]"

@@ -94,8 +94,11 @@ def test_no_process_of_a_run_outlives_it(background: Background, stop: signal.Si
     wait_until_gone(background.mark, END_S)
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("pages", [("review", "--token", TOKEN), ("annotate",)], ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    ("pages", "stop"),
+    [(("review", "--token", TOKEN), signal.SIGINT), (("annotate",), signal.SIGTERM)],
+    ids=["review", "annotate"],
+)
 def test_pages_for_people_end(
     background: Background, small: Checkout, pages: tuple[str, ...], stop: signal.Signals
 ) -> None:

@@ -15,11 +15,8 @@ pytestmark = pytest.mark.slow
 FAULTS = {"rate_limited": 0.1, "server_error": 0.1, "cut": 0.05}
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(80, 24), (160, 50)])
-def test_calls_are_shown_below_all_else_while_they_are_made(
-    own_study: Checkout, provider: Provider, columns: int, rows: int
-) -> None:
-    study = forget_answers(own_study)
+def test_calls_are_shown_below_all_else_while_they_are_made(own_study: Checkout, provider: Provider) -> None:
+    study, columns, rows = forget_answers(own_study), 80, 24
     provider.configure(faults=FAULTS, only_first_attempts=2, latency_s=1.0)
     register(study, provider, entry("image-model", "images"))
     path = experiment(study, ["image-model"], regimes=["standard"], budget_usd=20.0)

@@ -160,12 +160,6 @@ def test_an_undefined_kappa_is_null_with_the_reason(answers: list[str], reason: 
     assert rows.loc["panel", "undefined"].startswith(reason)
 
 
-def test_the_order_of_the_votes_does_not_matter() -> None:
-    votes = vote_rows(["yyy", "yyn", "n-n", "ynn"])
-    shuffled = votes.sample(frac=1, random_state=3)
-    pd.testing.assert_frame_equal(agreement(votes), agreement(shuffled))
-
-
 def test_votes_of_a_former_panel_are_left_out() -> None:
     votes = pd.concat([vote_rows(["yyy", "nnn"]), vote_rows(["yyn"], judges=("a", "b", "d"))], ignore_index=True)
     assert ratings(votes, ["a", "b", "c"]).values.tolist() == [[1, 1, 1], [0, 0, 0]]
@@ -191,13 +185,6 @@ def test_two_judges_have_a_kappa_and_one_agrees_with_nobody() -> None:
     alone = agreement(vote_rows(["y", "n"], judges=("a",)))
     assert list(alone["undefined"]) == ["one judge agrees with nobody"]
     assert alone["agreement"].isna().all()
-
-
-def test_rows_hold_alpha_and_a_pair_holds_nothing_of_a_panel() -> None:
-    rows = agreement(vote_rows(["yy-", "ynn", "nnn", "--y"])).set_index("judges")
-    assert rows.loc["panel", "alpha"] == pytest.approx(8 / 15)
-    assert rows.loc["a+b", ["n_undecided", "fleiss_kappa"]].isna().all()
-    assert np.isnan(rows.loc["panel", "cohen_kappa"])
 
 
 def test_bias_is_counted_by_dataset_and_of_the_panel_s_own_judges() -> None:

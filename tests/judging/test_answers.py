@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.judging.judged_answers import is_correct, normalise, to_label, to_number
+from traps_pipeline.judging.judged_answers import is_correct, normalise
 
 SIDES = ["left", "right", "elsewhere"]
 ALIASES = {
@@ -95,14 +95,3 @@ def test_a_number_inside_a_range_is_not_the_range(said: str) -> None:
 )
 def test_normal_form(text: str, normal: str) -> None:
     assert normalise(text) == normal
-
-
-def test_normal_form_is_its_own_normal_form() -> None:
-    for text in ("The Left-hand Bin!", "0 – 2", "3.50.", "A-1 to 2", "x--y..z", "an a the", "--.5 -1- 2"):
-        assert normalise(normalise(text)) == normalise(text)
-
-
-def test_a_value_names_one_number_one_label_or_nothing() -> None:
-    numbers = {"about twelve": 12, "1.5 or so": 1.5, "1, 2": None, "many": None, "-1": -1, ".5": 0.5, "-.5": -0.5}
-    assert {text: to_number(text) for text in numbers} == numbers
-    assert (to_label("Blue bin", SIDES, ALIASES), to_label("green bin", SIDES, ALIASES)) == ("right", None)

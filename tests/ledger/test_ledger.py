@@ -232,18 +232,6 @@ def test_a_second_run_waits_and_says_who_writes_until_that_one_is_killed(place: 
     assert len(said) == 1 and f"answers of m are being asked by process {holder.pid}" in said[0]
 
 
-def test_two_writers_of_one_process_exclude_each_other(ledger: Ledger) -> None:
-    async def scenario() -> None:
-        async with ledger.writing("m", print):
-            with pytest.raises(LockGivenUp):
-                async with ledger.writing("m", print, lambda: True):
-                    pass
-        async with ledger.writing("m", print):
-            pass
-
-    asyncio.run(scenario())
-
-
 def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: Ledger) -> None:
     async def scenario() -> list[str]:
         said = list[str]()
@@ -258,17 +246,6 @@ def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: L
     (said,) = asyncio.run(scenario())
     assert "are being asked by process" in said
     assert json.dumps(ledger.read("m").rows["a"]["text"]) == '"left"'
-
-
-def test_an_error_in_a_writers_block_is_what_is_raised(ledger: Ledger) -> None:
-    async def scenario() -> None:
-        async with ledger.writing("m", print) as writer:
-            await writer.write(answer("a", "left"))
-            raise TrapsError("something else")
-
-    with pytest.raises(TrapsError, match="something else"):
-        asyncio.run(scenario())
-    assert list(ledger.read("m").rows) == ["a"]
 
 
 def test_no_bit_of_a_row_can_flip_unseen(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -10,29 +11,18 @@ import pytest
 from traps_pipeline.ledger.rows import MOST_TOKENS, MOST_USD, heal, is_cost, is_count, is_seconds
 
 
-@pytest.mark.parametrize("value", [0, 1, MOST_TOKENS])
-def test_whole_numbers_from_nothing_to_the_most_that_a_call_can_take_are_counts(value: int) -> None:
-    assert is_count(value)
-
-
-@pytest.mark.parametrize("value", [-1, MOST_TOKENS + 1, 1.0, True, "1", None, math.nan])
-def test_anything_else_is_no_count(value: Any) -> None:
-    assert not is_count(value)
-
-
-@pytest.mark.parametrize("value", [0, 0.0, 0.25, MOST_USD])
-def test_finite_sums_up_to_the_most_that_a_call_can_cost_are_costs(value: float) -> None:
-    assert is_cost(value)
-
-
-@pytest.mark.parametrize("value", [-1e-9, MOST_USD + 1, math.inf, math.nan, True, "0.25", None])
-def test_anything_else_is_no_cost(value: Any) -> None:
-    assert not is_cost(value)
-
-
-@pytest.mark.parametrize(("value", "fits"), [(0, True), (0.5, True), (-0.5, False), (math.inf, False), ("1", False)])
-def test_a_call_takes_no_negative_and_no_endless_time(value: Any, fits: bool) -> None:
-    assert is_seconds(value) is fits
+@pytest.mark.parametrize(
+    ("fits", "values", "others"),
+    [
+        (is_count, [0, 1, MOST_TOKENS], [-1, MOST_TOKENS + 1, 1.0, True, "1", None, math.nan]),
+        (is_cost, [0, 0.0, 0.25, MOST_USD], [-1e-9, MOST_USD + 1, math.inf, math.nan, True, "0.25", None]),
+        (is_seconds, [0, 0.5], [-0.5, math.inf, "1"]),
+    ],
+)
+def test_counts_costs_and_times_are_what_a_call_can_take(
+    fits: Callable[[Any], bool], values: list[Any], others: list[Any]
+) -> None:
+    assert [value for value in values if not fits(value)] == [value for value in others if fits(value)] == []
 
 
 @pytest.mark.parametrize("outcome", ["answer", "truncated"])

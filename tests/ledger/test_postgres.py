@@ -8,10 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +17,7 @@ import sqlalchemy as sa
 
 from tests.build.ledger import answer, paid, write
 from tests.conftest import ROOT
-from tests.ledger.conftest import VARIABLE, Place, in_database, opened
+from tests.ledger.conftest import VARIABLE, in_database, opened
 from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import Ledger
@@ -155,70 +152,6 @@ def test_while_the_server_is_away_no_call_is_sent_and_then_the_run_ends_with_the
             TrapsError, match=rf"{VARIABLE}: the database at 127.0.0.1:{server.port}/postgres cannot be"
         ):
             asyncio.run(scenario())
-
-
-@contextmanager
-def proxy(port: int) -> Iterator[tuple[int, threading.Event]]:
-    """A port that leads to another one until the event is set, when all connections through it are cut."""
-    cut, ends = threading.Event(), list[socket.socket]()
-    listener = socket.create_server(("127.0.0.1", 0))
-
-    def pump(source: socket.socket, target: socket.socket) -> None:
-        try:
-            while data := source.recv(65536):
-                target.sendall(data)
-        except OSError:
-            pass  # cut
-        finally:
-            for end in (source, target):
-                end.close()
-
-    def accept() -> None:
-        while True:
-            try:
-                near, _ = listener.accept()
-            except OSError:
-                return
-            if cut.is_set():
-                near.close()
-                continue
-            far = socket.create_connection(("127.0.0.1", port))
-            ends.extend((near, far))
-            for pair in ((near, far), (far, near)):
-                threading.Thread(target=pump, args=pair, daemon=True).start()
-
-    def watch() -> None:
-        cut.wait()
-        for end in ends:
-            try:
-                end.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                continue
-
-    threading.Thread(target=accept, daemon=True).start()
-    threading.Thread(target=watch, daemon=True).start()
-    try:
-        yield listener.getsockname()[1], cut
-    finally:
-        cut.set()
-        listener.close()
-
-
-def test_a_writer_that_is_cut_off_sends_nothing_once_another_has_taken_over(postgres: Postgres, tmp_path: Path) -> None:
-    direct, calls = in_database(postgres), tmp_path / "calls"
-    with proxy(postgres.port) as (port, cut):
-        through = Place(("postgres", postgres.address(port=port), *direct.where[2:]))
-        with through.process(ASK, str(calls)) as process:
-            assert process.stdout is not None and process.stdout.readline() == "asking\n"
-            cut.set()
-
-            async def take_over() -> int:
-                async with direct.open().writing("m", print):
-                    sent = calls.stat().st_size
-                    await asyncio.sleep(1)
-                    return calls.stat().st_size - sent
-
-            assert asyncio.run(asyncio.wait_for(take_over(), 1200)) == 0
 
 
 @pytest.mark.parametrize(

@@ -19,13 +19,9 @@ def study(own_study: Checkout) -> Checkout:
     return own_study
 
 
-QUESTION = "Which domino of the row falls last of all?"
-
-
 def announced(study: Checkout, experiment: str = EXPERIMENT) -> tuple[int, int]:
     """New answers and votes of all models, by `traps plan`."""
-    printed = study.traps("plan", experiment)
-    assert printed.code == 0, printed.err
+    printed = study.traps("plan", experiment).ok()
     row = re.search(r"^all +[\d,]+ +[\d,]+ +([\d,]+) +[\d,]+ +[\d,]+ +([\d,]+)$", printed.out, re.MULTILINE)
     assert row and "upper bound" not in printed.out, printed.out
     return int(row[1].replace(",", "")), int(row[2].replace(",", ""))
@@ -33,20 +29,13 @@ def announced(study: Checkout, experiment: str = EXPERIMENT) -> tuple[int, int]:
 
 def asked(study: Checkout, experiment: str = EXPERIMENT) -> tuple[int, int]:
     """Answers and votes that the next run asks."""
-    finished = study.traps("run", experiment, "--until", "votes")
-    assert finished.code == 0, finished.err
+    finished = study.traps("run", experiment, "--until", "votes").ok()
     counts = finished.counts()
     return counts["answers"], counts["votes"]
 
 
 def correct_one_void(study: Checkout) -> None:
     study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
-
-
-def correct_labels(study: Checkout) -> None:
-    """The answers that reference models choose from."""
-    study.correct("domino_chain-0001", question=QUESTION)
-    study.correct("hidden_race-0003", question="Which of the balls leaves the tunnel before the other ones?")
 
 
 def edit_prompt(study: Checkout, name: str) -> None:
@@ -58,18 +47,17 @@ def edit_prompt(study: Checkout, name: str) -> None:
     ("change", "answers"),
     [
         (correct_one_void, 3 * 2),  # one item, of each model under each regime
-        (correct_labels, None),
         (lambda study: edit_prompt(study, "judge_abstention"), 0),
     ],
-    ids=["one question", "two questions", "a judge's prompt"],
+    ids=["one question", "a judge's prompt"],
 )
 def test_a_plan_after_a_change_announces_what_the_next_run_asks(
-    study: Checkout, change: Callable[[Checkout], None], answers: int | None
+    study: Checkout, change: Callable[[Checkout], None], answers: int
 ) -> None:
     assert announced(study) == (0, 0)
     change(study)
     plan = announced(study)
-    assert plan[1] > 0 and answers in (None, plan[0])
+    assert plan[1] > 0 and answers == plan[0]
     assert asked(study) == plan
     assert announced(study) == (0, 0)
 

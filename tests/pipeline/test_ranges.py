@@ -43,16 +43,6 @@ def test_whatever_is_missing_no_more_runs_than_asked_have_each_key_once(keys: se
     assert all(keys & {*keys_of(GRID, [one])} for one in ranges)
 
 
-@settings(deadline=None)  # a busy machine takes any time
-@given(keys=st.sets(st.sampled_from(sorted(GRID.keys)), min_size=60), most=st.integers(2, 12))
-def test_runs_of_any_pattern_of_holes_have_about_as_much_to_do(keys: set[str], most: int) -> None:
-    evaluations = {key.partition("|")[2] for key in keys}
-    shares = [len(keys & {*keys_of(GRID, [one])}) for one in cut(GRID, sorted(keys), most)]
-    # A cut is at the end of an evaluation, of which each has up to six keys, or of a model where runs are few.
-    whole = 6 * 9 if most <= len({name.partition("__")[0] for name in evaluations}) else 6
-    assert max(shares) - min(shares) <= 2 * whole
-
-
 @pytest.mark.parametrize(("n_datasets", "n_evaluations"), [(28, 195), (28, 30), (12, 100), (4, 195), (28, 1), (4, 3)])
 def test_a_study_of_whole_models_is_cut_into_as_many_runs_of_one_size(n_datasets: int, n_evaluations: int) -> None:
     grid = grid_of(n_datasets, n_evaluations)

@@ -50,12 +50,6 @@ def test_whole_models_are_few_runs(datasets: Sequence[str]) -> None:
     assert len(list(batches(CELL, keys))) == neighbours
 
 
-def test_a_gap_makes_two_ranges() -> None:
-    one_dataset = [key for key in CELLS if key.startswith("chaotic|")]
-    without = one_dataset[:3] + one_dataset[4:]
-    assert list(batches(CELL, without)) == [(without[0], without[2]), (without[3], without[-1])]
-
-
 def test_neighbours_of_one_dimension_are_one_range_and_no_keys_are_no_run() -> None:
     assert list(batches(CELL, [])) == []
     assert list(batches(DATASET, ["occlusion", "occlusion_ill_posed", "chaotic_ill_posed"])) == [

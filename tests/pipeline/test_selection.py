@@ -19,8 +19,7 @@ pytestmark = pytest.mark.slow
 def loaded(study: Checkout, *command: str, pandas: bool = False) -> str:
     """The last line of a command's output: which of the heavy libraries it has imported."""
     program = HEAVY.replace("*PANDAS", "" if pandas else "'pandas'")
-    finished = study.python("-c", program, *command)
-    assert finished.code == 0, finished.err
+    finished = study.python("-c", program, *command).ok()
     return finished.out.splitlines()[-1]
 
 

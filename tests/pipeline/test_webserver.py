@@ -21,7 +21,8 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.testclient import TestClient
 
-from tests.foreign_page import CHROMIUM, attack
+from tests.foreign_page import attack
+from tests.pages import CHROMIUM
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import Guard, token_for
 from traps_pipeline.cli import main

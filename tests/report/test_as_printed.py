@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 
-from tests.report.latex_tables import DATA, tables, text
 from traps_pipeline.report.catalogue import TABLE_REPORTS
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.writing import table_html
 from traps_pipeline.scoring.published import as_printed
 
-PAPER = json.loads(DATA.read_text(encoding="utf-8"))
+# The rows of the paper's tables by label, with the line of the label in its LaTeX source, without headings.
+PAPER = json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
 PRINTED = {table.name: table for report in TABLE_REPORTS for table in report.as_printed()}
 PLACES = as_printed("tables").set_index("label").to_dict("index")
 # The cells at the beginning of a row that name it, in the project's own words on the page; one where not listed.
@@ -85,24 +86,6 @@ def test_recomputed_tables_stand_apart_from_the_printed_ones() -> None:
     row = next(row for row in recomputed["replication_overall"].cells if row[:2] == ["llava-next-video-7b", "json"])
     assert row[2] == "0.023"
     assert ["llava-next-video-7b", "json", "29.8", "14.6", "5.0", ".025"] in PRINTED["replication_overall"].cells
-
-
-def test_the_script_reads_a_table_as_a_reader_does() -> None:
-    source = r"""
-\caption{Made up.}
-\label{tab:one}
-\begin{tabular}{l rr}
-\toprule
-& A & B \\
-\midrule
-\multicolumn{3}{l}{\textit{A part}} \\
-oc\_ip $\to$ ch & \textbf{0.5{\tiny$\pm$0.1}} & $-$3 \\
-\bottomrule
-\multicolumn{3}{l}{\footnotesize $^{*}$ a note} \\
-\end{tabular}
-"""
-    assert tables(source) == {"tab:one": {"line": 3, "rows": [["oc_ip → ch", "0.5 ± 0.1", "−3"]]}}
-    assert [text(cell) for cell in (r"$<$0", r"1{,}404", r"$12\times$", "---\\,$^{*}$")] == ["<0", "1,404", "12×", "–*"]
 
 
 def _of_text() -> set[str]:

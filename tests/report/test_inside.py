@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, cast
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -21,17 +20,13 @@ from traps_pipeline.mechanism.control_rows import (
     RISK_COVERAGE,
     SENTENCES,
     STEERING_NULLS,
-    STEERING_PECS,
 )
-from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
-from traps_pipeline.report.cards import Sources, figure_card
+from traps_pipeline.report.cards import Sources
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
-from traps_pipeline.report.page import report_html
-from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.result_frames import Makers, Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
@@ -39,7 +34,6 @@ from traps_pipeline.report.tables.control_reports import patching as patching_ta
 from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.steering_tables import steering as steering_tables
 from traps_pipeline.report.writing import PrintedTable
-from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.study import Layers, MechanismSettings, Study
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -208,14 +202,6 @@ def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
     assert row["Probe, guided"] == "0.960" and row["Output margin, guided"] == row["AbsRec %, standard"] == "–"
 
 
-def test_nulls_say_in_how_many_rows_a_direction_is_ahead() -> None:
-    first, _ = control_reports.steering_nulls(Made())
-    assert any("ahead of 19 of 20 draws in 1 of 1 rows" in note for note in first.notes)
-    assert control_reports._ahead(nulls().assign(n_at_least=2))[0].startswith(
-        "the void direction is ahead of 19 of 20 draws nowhere"
-    )
-
-
 def test_few_answers_are_marked_and_p_is_printed() -> None:
     nulls, _ = control_reports.steering_nulls(Made())
     (row,) = cells(nulls)
@@ -308,115 +294,9 @@ def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no
                for name in ("steering_top", "steering_dose", "steering_regimes", "steering_domains"))  # fmt: skip
 
 
-def test_figures_say_from_how_many_items_they_are_and_how_a_direction_ranks() -> None:
-    made = Made()
-    made.made["prompted_probes"] = probes().assign(n_voids=9)
-    axes = {report.name: report.make(made).axes[0] for report in FIGURE_REPORTS if report.name in INSIDE}
-    assert axes["probe_baselines"].get_title(loc="left") == "m, 9 to 16 items a side"
-    assert [label.get_text() for label in axes["probe_baselines"].get_xticklabels()] == ["ch †", "ch→oc †"]
-    title = axes["doses_among_nulls"].get_title(loc="left")
-    assert title.splitlines() == ["ch, standard→guided", "n 5†", "p + .05 – –"]  # of isotropic nulls on controls alone
-
-
-def test_titles_of_neighbours_do_not_overlap() -> None:
-    made = Made()
-    of = [effects().assign(source=name, target=name, directions="standard", regime="standard") for name in DATASETS]
-    ranks = [nulls().assign(target=name, regime="standard", null=null, side=side)
-             for name, null, side in product(DATASETS, NULLS, ("control", "void"))]  # fmt: skip
-    made.made["own_effects"], made.made["nulls"] = own_effects(pd.concat(of)), pd.concat(ranks)
-    figure = next(report for report in FIGURE_REPORTS if report.name == "doses_among_nulls").make(made)
-    figure.draw_without_rendering()
-    boxes = [ax._left_title.get_window_extent() for ax in figure.axes]
-    assert len(boxes) == 4 and all("p − .05 .05 .05" in ax.get_title(loc="left") for ax in figure.axes)
-    assert not any(a.overlaps(b) for a, b in pairwise(boxes))
-
-
-def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> None:
-    """Of a dataset whose sides nearly coincide, alpha 10 is twenty gaps."""
-    made = Made()
-    made.made["own_effects"] = own_effects(effects().assign(alpha=lambda rows: rows["alpha"].replace(200.0, 0.5)))
-    assert max(made.own_effects["gaps"]) == pytest.approx(20.0)
-    (axes,) = next(report for report in FIGURE_REPORTS if report.name == "doses_among_nulls").make(made).axes
-    assert axes.get_xlim()[1] < 2.5
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "1", "+", "−"]
-
-
-@pytest.mark.parametrize("name", ["gate_arrows", "doses_among_nulls"])
-def test_that_figures_are_not_comparable_is_said_beside_the_legend(name: str) -> None:
-    made = Made()
-    made.judged_by = "Judged by rules, not comparable: pocket."
-    figure = next(report for report in FIGURE_REPORTS if report.name == name).figure(made)
-    figure.draw_without_rendering()
-    (said,) = [text for text in figure.texts if "not comparable" in text.get_text()]
-    others = [figure.legends[0].get_window_extent(), *(axes.get_tightbbox() for axes in figure.axes)]
-    assert not any(said.get_window_extent().overlaps(box) for box in others if box is not None)
-
-
-def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
-    plane = next(report for report in FIGURE_REPORTS if report.name == "gate_arrows").make(Made()).axes[0]
-    assert plane.get_xlabel().startswith("J =") and plane.get_ylabel().startswith("Acc")
-    points = {(round(x, 6), round(y, 6)) for marks in plane.collections for x, y in np.asarray(marks.get_offsets())}
-    assert points >= {(0.5, 0.9), (0.8, 0.8)}  # J = 0.5 - 0 before the gate, 0.9 - 0.1 behind it
-    assert (0.9, 0.5) not in points
-
-
-def test_the_page_says_below_a_figures_title_what_it_shows(tmp_path: Path) -> None:
-    report = next(report for report in FIGURE_REPORTS if report.name == "patching")
-    sources = Sources(Workspace.create(tmp_path / "study", Study()))
-    assert figure_card(report, sources).why == "the experiment asks for no `patching`"
-    sources.study = Made()
-    page = report_html(frame(LEADERBOARD).astype(object), [figure_card(report, sources)])
-    assert (
-        f'<p class="shows">{report.note(Made())}</p>' in page
-        and "1 is the whole difference of the outcome" in report.doc
-    )
-
-
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
     made = Results()
     made.is_study = True
     assert "no `mechanism` section" in why(made)
     made.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
     assert why(made) == "this study has no such results yet"
-
-
-def steered() -> pd.DataFrame:
-    row = {"directions": "standard", "regime": "guided", "source": "chaotic", "target": "chaotic", "layer": 3}
-    row |= {"acc": 0.5, "false_abs": 0.0, "abs_rec": 0.5, "j": 0.5, "pecs": 0.25, "degenerate": 0.0}
-    row |= {"n_controls": 16, "n_voids": 16}
-    doses = product((("alpha", 0.0), ("alpha", 5.0), ("gap", 0.0), ("gap", 1.0)), ("label", "plus"))
-    return frame(STEERING_PECS, *(row | {"unit": unit, "dose": dose, "signs": signs} for (unit, dose), signs in doses))
-
-
-def test_the_unsteered_model_is_one_row_a_path() -> None:
-    made = Made()
-    made.made["steering_pecs"] = steered()
-    _, table = control_reports.steering_nulls(made)
-    found = [(row["Signs"], row["Dose"]) for row in cells(table)]
-    assert found[0] == ("not steered", "none") and len(found) == len(set(found)) == 5
-
-
-def test_gates_on_states_at_the_mid_threshold_come_first() -> None:
-    made, rows = Made(), gate()
-    first = rows.loc[(rows["features"] == "states") & (rows["target"] != "decoy")]
-    made.made["gate"] = pd.concat([rows.assign(features="length"), first.assign(threshold="J"), rows])
-    sources, controls, *_ = control_reports.gate(made)
-    assert [row["Threshold"] for row in cells(sources)] == ["mid", "mid", "J", "J"]
-    assert [row["Target"] for row in cells(sources)][:2] == ["all", "ch"]
-    made.made["gate"] = gate().assign(layer=-1)  # as the stage writes it of a mean over datasets
-    assert cells(control_reports.gate(made)[0])[0]["Layer"] == "–"
-    assert cells(controls)[0]["Features"] == "states"
-
-
-def test_the_deviation_of_noise_is_not_said_to_be_over_runs() -> None:
-    for table in (*control_reports.probe_baselines(Made()), control_reports.gate(Made())[-1]):
-        assert "± standard deviation over draws of noise" in table.remarks
-        assert any("log-odds that the first answer token" in note for note in table.notes)
-
-
-def test_the_page_of_a_study_that_looks_inside_explains_its_words() -> None:
-    results = PublishedResults()
-    for mechanism, there in ((None, False), (MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}), True)):
-        results.mechanism = mechanism
-        page = publish.report_files(results, [])[publish.PAGE].decode()
-        assert ("distance between the mean states of voids and of controls" in page) == there

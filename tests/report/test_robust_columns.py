@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tests.build.boards import board_of, board_row, tables
+from tests.build.boards import board_of, board_row
 from tests.build.cells import row
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text, leaderboards
@@ -58,15 +58,6 @@ def test_figures_that_cannot_join_pairs_and_arms_are_dashes_with_the_reason() ->
     assert cells["Conjunction %"] == cells["Robust"] == ["not run", "–"]
     for text in shown(refused):
         assert "no conjunction and no robust figure: pairs of epoch e1, arms of epoch e2" in text
-
-
-def test_other_columns_stay_as_they_are_and_datasets_have_no_figure_of_arms() -> None:
-    overall, *datasets = leaderboards(BOARD, robust_of())
-    plain = leaderboards(BOARD)[0]
-    assert [c for c in overall.columns if c.heading not in HEADINGS] == plain.columns
-    assert overall.rows[plain.rows.columns].equals(plain.rows)
-    assert not [table for table in datasets if {*HEADINGS} & {column.heading for column in table.columns}]
-    assert tables(BOARD)[0][0]["PECS"] == "0.250"
 
 
 def _columns(robust: pd.DataFrame) -> list[tuple[Any, list[str]]]:

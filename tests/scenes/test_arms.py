@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from tests.scenes.released import load
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.protocol.datasets import ARMS, arms_of, sides_of
-from traps_pipeline.scenes.picture.camera import Panel
 from traps_pipeline.scenes.variants import arms
 from traps_pipeline.scenes.worlds.outcome import Rejected
 
@@ -76,6 +74,8 @@ def test_panels_of_arms_come_stand_and_go_as_they_say():
     assert all(np.array_equal(a, b) for a, b in zip(removed.frames, [*void[:goes], *control[goes:]], strict=True))
     with pytest.raises(Rejected, match="first of the two events that are asked about happens behind the panel"):
         arms.ARMS["removed"].film(scenario("hidden_race-0001"))
+    with pytest.raises(Rejected, match="before the panel comes the two worlds differ in 0 pixels"):
+        arms.ARMS["late_panel"].film(scenario("hidden_race-0001"))
     late = arms.ARMS["late_panel"].film(bounce)
     at = round(late.evidence["covered_from_s"] * bounce.fps)
     assert at == bounce.control.outcome.commit_frame - 1  # never so late that the outcome was seen
@@ -83,25 +83,6 @@ def test_panels_of_arms_come_stand_and_go_as_they_say():
     decoy = arms.ARMS["decoy"].film(bounce)
     assert len(decoy.frames) == len(control) and decoy.evidence["panel_px"] >= arms.PANEL_PX
     assert decoy.evidence["hides_px"] == 0
-
-
-@pytest.mark.slow
-def test_a_panel_where_the_void_has_it_is_no_decoy(monkeypatch: pytest.MonkeyPatch):
-    bounce = scenario("bounce-0001")
-
-    def in_front(_: arms.Scenario, points: np.ndarray) -> Iterator[Panel]:
-        assert bounce.control.panel is not None
-        yield bounce.control.panel
-
-    monkeypatch.setattr(arms, "_decoys", in_front)
-    with pytest.raises(Rejected, match=r"no place for a panel that hides nothing \(the decoy shows \d+ pixels, hides"):
-        arms.ARMS["decoy"].film(bounce)
-
-
-@pytest.mark.slow
-def test_a_race_whose_worlds_look_alike_until_it_is_won_has_no_late_panel():
-    with pytest.raises(Rejected, match="before the panel comes the two worlds differ in 0 pixels"):
-        arms.ARMS["late_panel"].film(scenario("hidden_race-0001"))
 
 
 @pytest.mark.slow

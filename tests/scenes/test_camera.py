@@ -116,13 +116,6 @@ def test_the_panel_hides_the_whole_cover_box_and_stands_in_front_of_it(view: Vie
         assert gap == pytest.approx(PANEL_GAP, abs=1e-5)
 
 
-def test_the_panels_corners_are_those_of_an_upright_box_of_its_size() -> None:
-    panel = Panel((1.0, 2.0, 0.5), (0.4, 0.006, 0.5), 90.0)
-    corners = panel.corners()
-    assert np.allclose(corners.min(axis=0), (1 - 0.006, 2 - 0.4, 0.0))
-    assert np.allclose(corners.max(axis=0), (1 + 0.006, 2 + 0.4, 1.0))
-
-
 @pytest.mark.parametrize("view", VIEWS)
 def test_camera_and_panel_fit_together(view: View) -> None:
     cover = Box((-0.6, -0.3, 0.0), (0.2, 0.3, 0.5))

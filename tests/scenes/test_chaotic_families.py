@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from tests.scenes.released import Released, first_of_each, load
 from traps_pipeline.scenes.certification.certificates import (
     TWIN_OF_CUT,
     earliest_cut,
     futures_of,
     pair_of,
-    settled_outcome,
 )
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.certification.ensemble import (
@@ -30,71 +28,37 @@ from traps_pipeline.scenes.certification.ensemble import (
 from traps_pipeline.scenes.certification.evidence import Claim, Evidence
 from traps_pipeline.scenes.draw.resolve import choose_cut, open_cuts
 from traps_pipeline.scenes.draw.sample import Draw, try_draw
-from traps_pipeline.scenes.family_registry import families, get_family
-from traps_pipeline.scenes.physics.kit import Family, Motion, Physics
-from traps_pipeline.scenes.physics.simulate import replay, simulate
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.physics.simulate import simulate
 from traps_pipeline.scenes.picture.camera import Camera
-from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene
-from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene
 from traps_pipeline.scenes.worlds.world import World
 
-RELEASED = Path(__file__).parents[2] / "scene_specs" / "released"
-CHAOTIC = tuple(family.name for family in families() if family.taxonomy == "chaotic")
-DRAWN = tuple(name for name in CHAOTIC if (RELEASED / f"{name}.jsonl").is_file())
+FIRSTS = first_of_each("truncation")
 
 
-@dataclass(frozen=True)
-class Stored:
-    """A released record with everything rebuilt from it."""
-
-    spec: SceneSpec
-    family: Family
-    params: Any
-    physics: Physics
-    camera: Camera
-    qpos: np.ndarray
-    motion: Motion
-    outcome: Outcome
-
-    def cut(self, family: Family | None = None) -> Cut | None:
-        """The cut chosen anew."""
-        family = family or self.family
-        control = World(family, self.params, self.physics, self.qpos, self.camera, panel=None)
-        claim = replace(Claim.of_record(self.spec), family=family)
-        found = choose_cut(futures_of(control, self.spec.seed), claim, self.outcome.commit_frame)
-        return found[0] if found else None
-
-
-@pytest.fixture(scope="module", params=DRAWN)
-def stored(request: pytest.FixtureRequest) -> Stored:
+@pytest.fixture(scope="module", params=FIRSTS)
+def stored(request: pytest.FixtureRequest) -> Released:
+    """The first released scenario of a chaotic family."""
     return load(request.param)
 
 
-def load(name: str) -> Stored:
-    with (RELEASED / f"{name}.jsonl").open(encoding="utf-8") as lines:
-        spec = SceneSpec.model_validate(json.loads(next(lines)))
-    family, physics = get_family(name), Physics(**spec.physics)
-    params = family.params_from(spec.params)
-    camera = Camera.from_record(spec.camera)
-    qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
-    motion = replay(compile_scene(family, params, physics)[0], qpos, physics)
-    return Stored(spec, family, params, physics, camera, qpos, motion, settled_outcome(family, motion, params))
+def control_of(case: Released) -> World:
+    return World.of_record(case.spec, case.qpos)
 
 
-def test_the_stored_trajectory_ends_in_the_ground_truth(stored: Stored):
-    assert stored.outcome.label == stored.spec.ground_truth
-    assert round(stored.outcome.commit_frame / stored.physics.fps, 3) == stored.spec.evidence["commit_s"]
+def cut_of(case: Released, *, commit_frame: int | None = None, **family: Any) -> Cut | None:
+    """The cut chosen anew, with a changed family or another frame at which the outcome settles."""
+    control = control_of(case)
+    changed = replace(control, family=replace(case.family, **family))
+    claim = replace(Claim.of_record(case.spec), family=changed.family)
+    found = choose_cut(futures_of(changed, case.spec.seed), claim, commit_frame or control.outcome.commit_frame)
+    return found[0] if found else None
 
 
-def test_the_last_frames_of_the_void_carry_no_reading_of_the_outcome(stored: Stored):
-    assert stored.family.outcome(stored.motion, stored.params).labels[stored.spec.void["cut_frame"] - 1] is None
-
-
-def test_a_scenario_of_every_chaotic_family_is_certified(stored: Stored):
-    twin = load_trajectory(
-        RELEASED / "trajectories" / f"{stored.spec.scenario_id}.npz", stored.spec.twin.trajectory_sha256, "twin"
-    )
-    verdict = certify(stored.spec, stored.qpos, twin, frame_step=5)
+def test_a_scenario_of_every_chaotic_family_is_certified(stored: Released):
+    verdict = certify(stored.spec, stored.qpos, stored.twin, frame_step=5)
     assert verdict.failures == {}
     assert verdict.measured["twin_deviation_px"] <= 0.5
     evidence = stored.spec.evidence
@@ -103,82 +67,44 @@ def test_a_scenario_of_every_chaotic_family_is_certified(stored: Stored):
         assert verdict.measured["accepted"] == evidence["accepted"]
 
 
-def twin_certificate(case: Stored, *, rollout: int, twin: np.ndarray) -> tuple[Evidence, str | None]:
-    """What the certificate of a cut's twin measures if the record names this rollout and holds this trajectory."""
-    named = case.spec.twin.model_copy(update={"rollout": rollout})
-    pair = pair_of(case.spec.model_copy(update={"twin": named}), case.qpos, twin, frame_step=10)
-    measured = TWIN_OF_CUT.measured(pair)
-    return measured, TWIN_OF_CUT.failure(measured, pair.claim)
+def test_a_twin_is_rebuilt_from_the_start_that_the_record_names_and_from_no_other(stored: Released):
+    def rebuilt(twin: np.ndarray, more: int = 0) -> tuple[Evidence, str]:
+        """What the certificate measures and says if the record names a later start and holds this trajectory."""
+        assert stored.spec.twin.rollout is not None
+        named = stored.spec.twin.model_copy(update={"rollout": stored.spec.twin.rollout + more})
+        pair = pair_of(stored.spec.model_copy(update={"twin": named}), stored.qpos, twin, frame_step=10)
+        measured = TWIN_OF_CUT.measured(pair)
+        return measured, str(TWIN_OF_CUT.failure(measured, pair.claim))
 
-
-def test_a_twin_is_rebuilt_from_the_start_that_the_record_names_and_from_no_other(stored: Stored):
-    path, number = RELEASED / "trajectories" / f"{stored.spec.scenario_id}.npz", stored.spec.twin.rollout
-    twin = load_trajectory(path, stored.spec.twin.trajectory_sha256, "twin")
-    assert number is not None
-    measured, failure = twin_certificate(stored, rollout=number, twin=twin)
-    assert failure is None
-    assert (measured["rebuilt"], measured["start_off"]) == (True, 0.0)
-    measured, failure = twin_certificate(stored, rollout=number + 1, twin=twin)
-    assert "beside the start that the record names" in str(failure)
-    assert not measured["rebuilt"]
-    with pytest.raises(Rejected, match="there is no start 128"):
-        twin_certificate(stored, rollout=128, twin=twin)
-
-
-def test_the_future_of_a_twins_start_that_was_rounded_is_not_the_twin(stored: Stored):
-    path, number = RELEASED / "trajectories" / f"{stored.spec.scenario_id}.npz", stored.spec.twin.rollout
-    assert number is not None
-    twin = load_trajectory(path, stored.spec.twin.trajectory_sha256, "twin")
+    measured, failure = rebuilt(stored.twin)
+    assert (failure, measured["rebuilt"], measured["start_off"]) == ("None", True, 0.0)
+    measured, failure = rebuilt(stored.twin, more=1)
+    assert "beside the start that the record names" in failure and not measured["rebuilt"]
     model, scene = compile_scene(stored.family, stored.params, stored.physics)
-    model.qpos0[:] = twin[0]  # float32, as it is stored
-    rounded = simulate(model, scene, stored.physics)
-    measured, failure = twin_certificate(stored, rollout=number, twin=rounded)
+    model.qpos0[:] = stored.twin[0]  # rounded to float32, as it is stored
+    measured, failure = rebuilt(simulate(model, scene, stored.physics))
     assert (measured["rebuilt"], measured["start_off"]) == (False, 0.0)
-    assert "its trajectory is of another start" in str(failure) or "the twin ends in" in str(failure)
+    assert "its trajectory is of another start" in failure or "the twin ends in" in failure
+    with pytest.raises(Rejected, match="there is no start"):
+        rebuilt(stored.twin, more=128)
+
+
+def test_no_cut_where_starts_are_alike_or_part_at_once_or_the_outcome_settles_within_a_second(stored: Released):
+    assert cut_of(stored, perturbation=0.0) is None
+    assert cut_of(stored, perturbation=0.05) is None
+    assert cut_of(stored, commit_frame=10) is None
 
 
 @pytest.mark.slow  # simulates 128 futures
-def test_a_cut_that_is_too_late_is_named_on_any_machine():  # on this one test_certify_command.py alters such a cut
-    plinko = load("plinko")
-    twin = load_trajectory(
-        RELEASED / "trajectories" / f"{plinko.spec.scenario_id}.npz", plinko.spec.twin.trajectory_sha256, "twin"
-    )
-    late = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame}})
-    elsewhere = certify(late, plinko.qpos + np.float32(1e-7), twin, frame_step=10)
+def test_a_cut_that_is_too_late_is_named_on_any_machine():
+    plinko = load("plinko-0001")
+    settles = control_of(plinko).outcome.commit_frame
+    late, beyond = (plinko.spec.model_copy(update={"void": {"cut_frame": settles + more}}) for more in (0, 1))
+    elsewhere = certify(late, plinko.qpos + np.float32(1e-7), plinko.twin, frame_step=10)
     assert not elsewhere.same_physics  # the futures of such a machine are simulated all the same
     assert "open" in elsewhere.failures
     assert elsewhere.measured["tried"] == 128
-    beyond = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame + 1}})
-    assert "after commitment" in certify(beyond, plinko.qpos, twin, frame_step=10).failures["cut"]
-
-
-def test_identical_starts_leave_no_outcome_open_and_yield_no_cut(stored: Stored):
-    assert stored.cut(replace(stored.family, perturbation=0.0)) is None
-
-
-def test_a_board_without_pegs_has_one_certain_outcome_and_yields_no_cut():
-    plinko = load("plinko")
-    # The board keeps its size: the rows still count, but all their pegs lie beyond the walls and are left out.
-    bare = replace(plinko.params, row_shifts_m=(99.0,) * plinko.params.rows)
-    model, scene = compile_scene(plinko.family, bare, plinko.physics)
-    qpos = simulate(model, scene, plinko.physics)
-    labels = plinko.family.outcome(replay(model, qpos, plinko.physics), bare).labels
-    commit = labels.index(labels[-1])
-    assert not [i for i in range(model.ngeom) if model.geom(i).name.startswith("peg")]
-    assert labels[-1] is not None
-    assert commit >= earliest_cut(plinko.physics)
-    control = World(plinko.family, bare, plinko.physics, qpos, plinko.camera, panel=None)
-    futures = futures_of(control, plinko.spec.seed)
-    assert choose_cut(futures, Claim.of_record(plinko.spec), commit) is None
-
-
-def test_a_perturbation_that_shows_before_one_second_yields_no_cut(stored: Stored):
-    assert stored.cut(replace(stored.family, perturbation=0.05)) is None
-
-
-def test_an_outcome_committed_before_one_second_yields_no_cut(stored: Stored):
-    early = replace(stored, outcome=replace(stored.outcome, commit_frame=10))
-    assert early.cut() is None
+    assert "after commitment" in certify(beyond, plinko.qpos, plinko.twin, frame_step=10).failures["cut"]
 
 
 @pytest.mark.parametrize(
@@ -242,7 +168,7 @@ def test_an_outcome_above_60_percent_makes_no_cut_however_high_the_entropy():
 # --- the state at the cut ---------------------------------------------------------------------------------------------
 
 
-def ball_and_lever() -> mujoco.MjModel:
+def ball_and_lever() -> tuple[mujoco.MjModel, mujoco.MjData]:
     """A ball of 5 cm that lies on a plate, and a lever whose ends are half a metre from its hinge."""
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1])
@@ -252,15 +178,16 @@ def ball_and_lever() -> mujoco.MjModel:
     lever = spec.worldbody.add_body(name="lever", pos=[0, 2, 1])
     lever.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
     lever.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.1, 0.4, 0])
-    return spec.compile()
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
 
 
 def test_what_no_viewer_resolves_is_a_tenth_of_a_pixel_where_a_thing_is() -> None:
     # Eye at y = -2, half-angle 45 degrees: a pixel is 2/180 m at the ball, which is 2 m away, and 4/180 m at the lever.
     camera = Camera((0, 0, 0), 2.0, 90.0, 0.0, 90.0, 1.0, (0, 0, 0))
-    model = ball_and_lever()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    model, data = ball_and_lever()
     found = unseen_steps(model, data, camera)
     assert found[:3] == pytest.approx(0.1 * 2 / 180)
     assert found[3:6] == pytest.approx(0.1 * 2 / 180 / 0.05)
@@ -268,22 +195,19 @@ def test_what_no_viewer_resolves_is_a_tenth_of_a_pixel_where_a_thing_is() -> Non
 
 
 def test_a_thing_that_lies_on_another_is_moved_along_it_and_not_into_it() -> None:
-    model = ball_and_lever()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    model, data = ball_and_lever()
     assert data.ncon == 1
     step = along_contacts(model, data, np.array([3e-4, 2e-4, 5e-4, 1e-3, 0, 0, 1e-3]))
     assert step == pytest.approx([3e-4, 2e-4, 0, 1e-3, 0, 0, 1e-3], abs=1e-12)
 
 
-def test_the_futures_of_the_state_at_a_cut_disagree_and_are_the_same_each_time(stored: Stored):
-    control = World(stored.family, stored.params, stored.physics, stored.qpos, stored.camera, panel=None)
-    cut = stored.spec.void["cut_frame"]
-    found = futures_of(control, stored.spec.seed, cut).after(cut)
-    assert found == futures_of(control, stored.spec.seed, cut).after(cut)
+def test_the_futures_of_the_state_at_a_cut_disagree_and_are_the_same_each_time(stored: Released):
+    control, seed, cut = control_of(stored), stored.spec.seed, stored.spec.void["cut_frame"]
+    found = futures_of(control, seed, cut).after(cut)
+    assert found == futures_of(control, seed, cut).after(cut)
     assert found.total() == 48 and len(found) > 1
-    late = stored.outcome.commit_frame + 1
-    assert futures_of(control, stored.spec.seed, late).after(late)[stored.spec.ground_truth] > 40
+    late = control.outcome.commit_frame + 1
+    assert futures_of(control, seed, late).after(late)[stored.spec.ground_truth] > 40
 
 
 @pytest.mark.slow  # draws a scenario up to its certificates
@@ -295,9 +219,8 @@ def test_a_draw_whose_recorded_outcome_is_a_rare_future_of_its_cut_is_rejected()
     )
 
 
-@pytest.mark.parametrize("name", CHAOTIC)
-def test_questions_word_their_choices_and_their_answers(name: str):
-    family = get_family(name)
+def test_questions_word_their_choices_and_their_answers(stored: Released):
+    family = stored.family
     for draw in range(50):
         rng = np.random.default_rng([5, draw])
         wording = family.word(family.draw(rng), rng)

@@ -129,8 +129,7 @@ def test_two_studies_with_the_same_scene_render_it_once(tmp_path: Path, monkeypa
     (tmp_path / "one.yaml").write_text(ONE_SCENARIO)
 
     def frames_drawn_in(name: str) -> int:
-        finished = Checkout(ROOT, tmp_path / name).traps("run", tmp_path / "one.yaml", "--until", "items")
-        assert finished.code == 0, finished.err
+        finished = Checkout(ROOT, tmp_path / name).traps("run", tmp_path / "one.yaml", "--until", "items").ok()
         return finished.counts()["frames"]
 
     def clips(name: str) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.build.errors import raises
 from tests.build.frames import frames
-from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import CHROMIUM, a_browser
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
@@ -57,23 +57,15 @@ def test_what_is_decoded_looks_like_what_was_drawn(clip: Path) -> None:
         assert abs(np.flatnonzero(red).min() - 5 * i) <= 2
 
 
-def test_a_clip_may_have_one_frame(tmp_path: Path) -> None:
-    encode(frames(1), tmp_path / "one.mp4", 10)
-    assert decode(tmp_path / "one.mp4")[1].tolist() == [0.0]
-
-
-def test_a_clip_cut_off_anywhere_is_named_with_the_remedy(clip: Path) -> None:
+def test_a_clip_cut_off_anywhere_or_none_at_all_is_named_with_the_remedy(clip: Path, tmp_path: Path) -> None:
     whole = clip.read_bytes()
     for kept in [*range(0, len(whole), len(whole) // 40), len(whole) - 1]:
         clip.write_bytes(whole[:kept])
         with raises(DamagedClip, "video.encode.decode", "clip.mp4"):
             decode(clip)
-
-
-def test_what_is_no_clip_or_is_not_there_is_named(tmp_path: Path) -> None:
     (tmp_path / "words.mp4").write_text("no clip")
     for name in ("words.mp4", "nothing.mp4"):
-        with raises(DamagedClip, "video.encode.decode"):
+        with raises(DamagedClip, "video.encode.decode", name):
             decode(tmp_path / name)
 
 
@@ -188,15 +180,11 @@ def test_a_clip_states_the_colours_that_it_is_encoded_by(tmp_path: Path, width: 
 @pytest.mark.skipif(shutil.which(CHROMIUM) is None, reason="chromium is not installed")
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_browser_shows_the_pixels_that_a_model_is_shown(tmp_path: Path, width: int, height: int) -> None:
-    from playwright.sync_api import sync_playwright
-
     encode([patches(width, height)] * 5, tmp_path / "clip.mp4", 10)
     decoded, _ = decode(tmp_path / "clip.mp4")
     source = f"data:video/mp4;base64,{base64.b64encode((tmp_path / 'clip.mp4').read_bytes()).decode()}"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+    with a_browser() as browser:
         drawn = browser.new_page().evaluate(DRAWN, [source, 0.25])
-        browser.close()
     png = np.frombuffer(base64.b64decode(drawn.partition(",")[2]), np.uint8)
     shown = cv2.imdecode(png, cv2.IMREAD_COLOR)
     assert shown is not None and shown.shape == (height, width, 3)

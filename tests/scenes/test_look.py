@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +15,10 @@ from tests.scenes.released import load
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli.benchmark_commands import LOOKS
-from traps_pipeline.scenes.certification.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.redraw import relook_family, with_look
-from traps_pipeline.scenes.draw.resolve import Resolved
-from traps_pipeline.scenes.draw.sample import Draw, load_tallies, record_line, sample_family, save_tallies, try_draw
+from traps_pipeline.scenes.draw.sample import load_tallies, record_line, save_tallies
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.floor import PALE
 from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
 from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.picture.render import Renderer
@@ -71,19 +67,6 @@ def test_a_draws_look_follows_from_its_number_and_varies_in_the_parts_that_are_n
     floor = look_of_draw(1, "bounce", 4, ("floor",))
     assert floor is not None and floor.floor_pattern is not None
     assert replace(floor, **{f: getattr(Look(), f) for f in vars(floor) if f.startswith("floor_")}) == Look()
-
-
-def test_pale_floors_have_no_dark_tone_and_count_before_others() -> None:
-    pale = [look_of_draw(1, "bounce", number, ("pale-floor",)) for number in range(60)]
-    assert {tone for look in pale if look for tone in look.floor_tones} == set(PALE)
-    assert pale == [look_of_draw(1, "bounce", number, ("floor", "pale-floor")) for number in range(60)]
-    assert pale != [look_of_draw(1, "bounce", number, ("floor",)) for number in range(60)]
-
-
-def test_nobody_stands_behind_half_of_the_scenes_and_two_or_three_behind_the_others() -> None:
-    drawn = [look_of_draw(1, "bounce", number, ("bystanders",)) for number in range(200)]
-    count = Counter(len(look.bystanders) for look in drawn if look)
-    assert set(count) == {0, 2, 3} and 80 <= count[0] <= 120
 
 
 def test_released_records_look_as_their_draws_say_and_differ() -> None:
@@ -208,33 +191,3 @@ def test_under_another_look_a_record_loses_every_certificate_that_it_does_not_pa
     soon = round(case.spec.evidence["commit_s"] * case.physics.fps) + 4  # 0.6 s are wanted
     early = case.spec.model_copy(update={"control": {**case.spec.control, "closes_frame": soon}})
     assert str(with_look(early, None, case.qpos, case.twin)).startswith("closing: the panel comes at")
-
-
-@pytest.mark.slow
-def test_a_panel_of_tiles_hides_the_worlds_at_720_lines_as_well() -> None:
-    case = load("bounce-0001")
-    pair = pair_of(case.spec, case.qpos, case.twin, frame_step=10)
-    look = Look(material="tiles", size="720p")
-    control, twin = (
-        replace(world, params=replace(world.params, look=look)) for world in (pair.control, pair.other_world)
-    )
-    found: dict[str, object] = {}
-    for certificate in (HIDDEN, ABLATION, TWIN_BEHIND_PANEL):
-        found |= certificate.measured(replace(pair, control=control, twin=twin))
-    assert (found["past_panel_px"], found["ablation_px"], found["twin_px"]) == (0, 0, 0)
-    assert found["hidden_alone"] and found["twin_answer"] == case.spec.twin.ground_truth
-    assert control.void_frames[0].shape == (720, 960, 3)
-
-
-@pytest.mark.slow
-def test_a_scene_is_drawn_and_certified_under_a_look(tmp_path: Path) -> None:
-    parts = tuple(sorted({*get_family("bounce").looks, "floor"}))
-    tally = sample_family("bounce", 1, 3, tmp_path, look=["floor"], workers=1)
-    assert load_tallies(tmp_path)["bounce"].look == tally.look == [*parts]
-    found = try_draw(Draw("bounce", 3, tally.draws - 1, frozenset(), parts))
-    assert isinstance(found, Resolved)
-    look = look_of_draw(3, "bounce", tally.draws - 1, parts)
-    params = get_family("bounce").params_from(found.spec.params)
-    twin = get_family("bounce").params_from(found.spec.twin.params or {})
-    assert params.look == twin.look == look
-    assert found.spec.evidence["twin_px"] == 0 and found.spec.evidence["ablation_px"] == 0

@@ -13,7 +13,6 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.shortcut_rules import CUT_FRAMES
 from traps_pipeline.scenes.certification.certificates import PACE, pair_of, stored_evidence
 from traps_pipeline.scenes.certification.evidence import Claim
-from traps_pipeline.scenes.draw.sample import Draw, try_draw
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
 from traps_pipeline.scenes.worlds.pace import cut_to, lengths, settles_share
@@ -57,11 +56,6 @@ def test_a_clip_that_ends_earlier_is_the_beginning_of_the_same_motion() -> None:
     case = load(EARLY)
     assert np.array_equal(case.qpos, whole(EARLY).qpos[: len(case.qpos)])
     assert len(case.qpos) == len(case.twin) < 50
-
-
-def test_a_draw_whose_outcome_settles_too_late_is_rejected_before_it_costs_certificates() -> None:
-    late = try_draw(Draw("plinko", 1, 19, frozenset(), ("floor",)))  # after 4.3 of 5 s
-    assert late == "the outcome settles after 86% of the clip, 80% at most is wanted"
 
 
 @pytest.mark.parametrize(("n_frames", "failure"), [(50, "after 16% of the clip"), (24, None)])

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, make_dataclass
 
 import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.scenes.parts import floor, observers, questions, vary, vision
+from traps_pipeline.scenes.parts import observers, questions, vary, vision
 from traps_pipeline.scenes.parts import readings as outcome
-from traps_pipeline.scenes.parts.board import Board
-from traps_pipeline.scenes.parts.course import Course, Surface, brake
-from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
+from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.physics.kit import COLOURS, Motion, Physics
 
 PLAY = vary.apart("red", "green", "blue", "yellow")
@@ -104,36 +101,6 @@ def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
     box = course.box((0.1, 0.5), (0, 1), (0, 1), right=0.02)
     assert (box.low[0], box.high[0]) == ((0.1, 0.52) if direction > 0 else (-0.5, -0.08))
     assert course.ahead(0.3) == (0.3 if direction > 0 else 0.0)
-
-
-def test_a_stage_towards_a_side_adds_to_the_same_world() -> None:
-    course = Course(Physics())
-    left = course.towards(-1)
-    np.testing.assert_allclose(left.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red").pos, [-0.4, 0.5, 0.5])
-    assert left.spec is course.spec
-    assert (left.direction, course.direction) == (-1, 1)
-
-
-def test_a_tray_has_the_walls_that_are_given_a_height() -> None:
-    course = Course(Physics())
-    names = course.tray("bin", (0, 1), (-1, 1), (0.1, 0.2), "red", wall=0.05, near=0.5, front=0.3)
-    assert names == ("bin_floor", "bin_near", "bin_front")
-    near = next(geom for geom in course.spec.worldbody.geoms if geom.name == "bin_near")
-    np.testing.assert_allclose(near.pos, [-0.025, 0, 0.3])
-
-
-def test_places_on_a_ramp() -> None:
-    np.testing.assert_allclose(Ramp(30, 0.1).at(1.0), [-np.sqrt(3) / 2, 0, 0.6])
-    np.testing.assert_allclose(Ramp(30, 0.1).at(0.0, over=0.2), [0.1, 0, 0.1 + 0.1 * np.sqrt(3)])
-    away = Ramp(30, 0.1, foot_m=0.5, towards_camera=True, middle_m=0.2).at(1.0, aside=0.1)
-    np.testing.assert_allclose(away, [0.3, 0.5 + np.sqrt(3) / 2, 0.6])
-    np.testing.assert_allclose(SteppedRamp(1.0, 45, 0.2).at(0.25), [0.25, 0, 0.95])
-
-
-def test_a_rough_surface_takes_its_share_of_a_balls_speed() -> None:
-    rolling = brake(0.05, 1.0, 0.5, Physics())
-    slowing = 5 * Physics().gravity_m_s2 * rolling / (7 * 0.05)
-    assert 2 * slowing * 0.5 == pytest.approx(1.0)
 
 
 # --- outcome ----------------------------------------------------------------------------------------------------------
@@ -245,16 +212,6 @@ def test_what_was_struck_has_begun_and_what_nothing_moves_at_has_not() -> None:
     assert foresee(pushed, named) == "yes"
 
 
-def test_a_finder_takes_what_has_the_size_and_shape_of_a_ball() -> None:
-    frame = np.full((360, 480, 3), 200, np.uint8)
-    frame[150:170, 100:160] = np.array(COLOURS["red"]) * 255  # three times as wide as high
-    assert observers.compact(frame, "red") is None
-    assert observers.compact(frame, "red", shape=(0.3, 3.5)) is not None
-    assert observers.compact(frame, "red", shape=(0.3, 3.5), area=1200) is None
-    assert observers.rounded(frame, "red", longer=3.1) is None  # it fills its box, as a panel does
-    assert observers.rounded(frame, "red", longer=3.1, fill=1.1) is not None
-
-
 def test_an_observer_sees_no_flag_and_sees_what_is_no_flag() -> None:
     frames = np.full((3, 360, 480, 3), 200, np.uint8)
     frames[:, 100:160, 60:63] = 45  # a mast, and a red flag at its upper end, to the right
@@ -267,42 +224,3 @@ def test_an_observer_sees_no_flag_and_sees_what_is_no_flag() -> None:
     bare = frames.copy()
     bare[:, 100:160, 60:63] = 200  # without its mast it is a thing
     assert np.array_equal(vision.without_flags(bare), bare)
-
-
-def test_how_far_a_body_turns_is_its_greatest_angle_from_where_it_stands_at_first() -> None:
-    def about_z(degrees: float) -> np.ndarray:
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-
-    path = np.stack([about_z(20 + turn) for turn in (0, 5, -12, 3)])
-    assert outcome.turns_deg(path) == pytest.approx(12.0, abs=1e-6)
-    assert outcome.turns_deg(path[:1]) == 0.0
-
-
-# --- floors and boards ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("pattern", "share"), [("plain", 0.0), ("checks", 0.5), ("stripes", 0.5)])
-def test_a_floors_second_tone_covers_its_share(pattern: str, share: float) -> None:
-    assert floor._shares(pattern).mean() == share
-
-
-def test_planks_have_joints_of_the_second_tone_and_an_unknown_floor_is_refused() -> None:
-    planks = floor._shares("planks")
-    assert (planks == 1).mean() == pytest.approx(0.075, abs=0.02)  # 6 % between planks, 1.6 % at their ends
-    assert planks.min() == 0.0
-    with raises(ValueError, "scenes.parts.floor._shares", "sea", "checks"):
-        floor._shares("sea")
-
-
-def test_pegs_stand_only_where_they_may() -> None:
-    def names(where: Callable[[float, float], bool]) -> set[str]:
-        board = Board(
-            Physics(), tilt_deg=30, width_m=1.0, ball_radius_m=0.03, light=(0.5, 0.5, 0.5), bounce=(-20000.0, -8.0)
-        )
-        board.pegs([0.5, 0.6], [0.0, 0.05], 0.1, 0.01, "grey", square=False, where=where)
-        return {geom.name for geom in board.spec.geoms if geom.name.startswith("peg_")}
-
-    everywhere, right = names(lambda across, up: True), names(lambda across, up: across > 0 and up < 0.55)
-    assert right == {"peg_0_21", "peg_0_22", "peg_0_23", "peg_0_24"}  # 0.1 to 0.4 m in the lower row
-    assert right < everywhere and "peg_1_20" in everywhere

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
-from traps_pipeline.scenes.certification.certificates import ABLATION, CLOSING, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.picture import render
-from traps_pipeline.scenes.worlds.outcome import moving_geoms
 from traps_pipeline.scenes.worlds.world import World
 
 
@@ -40,36 +38,6 @@ def test_a_pose_that_stays_is_drawn_once_and_looks_as_if_drawn_again() -> None:
     with world.renderer() as renderer:  # each after another pose
         order = [case.qpos[0], last[0], case.qpos[0], last[1]]
         assert all(np.array_equal(frame, resting[0]) for frame in list(renderer.frames(order))[1::2])
-
-
-@pytest.mark.slow
-def test_what_moves_and_is_taken_away_makes_no_other_picture() -> None:
-    case = load("hidden_drop-0001")
-    world = World.of_record(case.spec, case.qpos)
-    moving, shown = moving_geoms(world.model), case.qpos[[0, 10, 20]]
-    assert (shown[0] != shown[1]).any() and (shown[1] != shown[2]).any()
-    with patch.object(mujoco, "mjr_render", wraps=mujoco.mjr_render) as drawn, world.renderer() as renderer:
-        already = drawn.call_count
-        once = list(renderer.frames(shown, panel=True, without=moving))
-        assert drawn.call_count == already + 1
-        each = [
-            next(renderer.frames([row], panel=True, without=moving)) for row in shown for _ in renderer.frames([row])
-        ]
-        assert drawn.call_count == already + 1 + 6
-    assert all(np.array_equal(a, b) for a, b in zip(once, each, strict=True))
-
-
-@pytest.mark.slow
-def test_the_end_of_a_closed_control_is_looked_at_without_drawing_the_void_again() -> None:
-    case = load("hidden_drop-0001")
-    pair = pair_of(case.spec, case.qpos, case.twin)
-    with patch.object(mujoco, "mjr_render", wraps=mujoco.mjr_render) as drawn:
-        for certificate in (HIDDEN, ABLATION, TWIN_BEHIND_PANEL):
-            certificate.measured(pair)
-        already = drawn.call_count
-        found = CLOSING.measured(pair)
-        assert drawn.call_count == already
-    assert (found["closed_px"], found["closed_change_px"]) == (0, 0)
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,46 +18,13 @@ from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.certification.certificates import HIDDEN, SAME_START_M, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.course import Course
-from traps_pipeline.scenes.parts.soft_bodies import hammock, rope, soft_ball
-from traps_pipeline.scenes.physics.kit import Box, Physics, Scene
-from traps_pipeline.scenes.physics.simulate import replay, simulate, swept_points
 from traps_pipeline.scenes.picture.checks import differing_pixels
-from traps_pipeline.scenes.worlds.outcome import decisive_geoms, moving_geoms, read_outcome
+from traps_pipeline.scenes.worlds.outcome import read_outcome
 from traps_pipeline.scenes.worlds.world import World
 
 RELEASED = OWN_SPECS / "extensions" / "soft_bodies" / "released"
 FAMILIES = ("soft_ball", "soft_hammock", "soft_rope")
 FIRSTS = [f"{family}-0001" for family in FAMILIES]
-SHORT = Physics(duration_s=0.4)  # frames at 0, 0.1, 0.2 and 0.3 s
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What `Course.scene` needs of a family's parameters."""
-
-    azimuth_deg: float = 90.0
-    elevation_deg: float = -20.0
-
-
-def scene_of(course: Course, soft: str) -> Scene:
-    return course.scene(Seen(), decisive=[soft], in_view=[Box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.1))])
-
-
-# --- how they move ----------------------------------------------------------------------------------------------------
-
-
-def test_a_soft_ball_that_is_thrown_falls_as_any_body_does() -> None:
-    course = Course(SHORT, direction=-1)
-    soft_ball(course, "ball", (0.2, 0, 1.0), 0.07, "red", thrown=(0.5, 2.0), young=4000.0, mass=0.4)
-    scene = scene_of(course, "ball")
-    model = scene.spec.compile()
-    middle = replay(model, simulate(model, scene, SHORT), SHORT).pos("ball")
-    t = np.arange(4) / 10
-    # The way leads to the left; 1 + 2 t - 9.81 t^2 / 2, but for the step of 2 ms by which speed and place differ.
-    assert middle[:, 0] == pytest.approx(-0.2 - 0.5 * t, abs=2e-3)
-    assert middle[:, 2] == pytest.approx(1.0 + 2.0 * t - 4.905 * t**2, abs=9.81 * 0.002 * 0.3)
-    assert middle[:, 1] == pytest.approx(0.0, abs=1e-6)
 
 
 BUILD = """
@@ -79,37 +46,6 @@ def test_a_soft_ball_is_the_same_to_the_last_bit_whatever_a_process_built_before
         for radii in (["0.0731"], ["0.0787", "0.0731"])
     ]
     assert built[0].stdout == built[1].stdout != ""
-
-
-def test_a_hammock_stays_where_it_is_tied_and_falls_where_it_is_not() -> None:
-    course = Course(SHORT)
-    hammock(course, "cloth", (0, 0, 0.5), (0.4, 0.2), (4, 2), "red", sag=0.06, tied=(-1,))
-    scene = scene_of(course, "cloth")
-    model = scene.spec.compile()
-    cloth = replay(model, simulate(model, scene, SHORT), SHORT).vertices["cloth"]
-    assert cloth.shape == (4, 5 * 3, 3)
-    assert cloth[0, :, 2].min() == pytest.approx(0.44) and cloth[0, :, 2].max() == pytest.approx(0.5)
-    corners = np.flatnonzero((abs(cloth[0, :, 0]) > 0.199) & (abs(cloth[0, :, 1]) > 0.099))
-    fallen = cloth[0, corners, 2] - cloth[-1, corners, 2]
-    tied = cloth[0, corners, 0] < 0
-    assert tied.sum() == 2 and abs(fallen[tied]).max() < 0.01 and fallen[~tied].min() > 0.1
-
-
-def test_a_ropes_swept_boxes_are_those_of_its_links() -> None:
-    course = Course(SHORT)
-    rope(course, "rope", (0, 0, 0.9), 0.6, 0.01, "red", thrown=(0.0, 0.0), links=6)
-    scene = scene_of(course, "rope")
-    model = scene.spec.compile()
-    boxes = swept_points(model, simulate(model, scene, SHORT)[:1]).reshape(-1, 8, 3)
-    # Six links of 0.1 m side by side, each 0.01 m thicker to all sides.
-    assert len(boxes) == 6
-    assert boxes.min(axis=(0, 1)) == pytest.approx([-0.31, -0.01, 0.89], abs=1e-6)
-    assert boxes.max(axis=(0, 1)) == pytest.approx([0.31, 0.01, 0.91], abs=1e-6)
-    assert np.ptp(boxes[:, :, 0], axis=1) == pytest.approx([0.12] * 6, abs=1e-6)
-    assert decisive_geoms(model, ["rope"]) == moving_geoms(model) == ("rope",)
-
-
-# --- how they are seen ------------------------------------------------------------------------------------------------
 
 
 def test_a_soft_body_is_counted_and_taken_away_like_a_geom() -> None:

@@ -33,35 +33,24 @@ def test_a_trajectory_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert np.array_equal(read, QPOS)
 
 
-def test_an_altered_trajectory_is_named_with_the_remedy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", ["altered", "cut off", "empty", "no archive", "missing", "a pickle"])
+def test_what_is_not_the_trajectory_that_was_written_is_named(tmp_path: Path, damage: str) -> None:
     save_trajectory(tmp_path, "plinko-0001", QPOS, QPOS)
-    digest = trajectory_digest(QPOS)
-    altered = QPOS.copy()
-    altered[2, 1] += 1e-6
-    save_trajectory(tmp_path, "plinko-0001", altered, QPOS)
+    path, other = tmp_path / "plinko-0001.npz", QPOS.copy()
+    other[2, 1] += 1e-6
+    match damage:
+        case "altered":
+            save_trajectory(tmp_path, "plinko-0001", other, QPOS)
+        case "cut off":
+            path.write_bytes(path.read_bytes()[:-30])
+        case "missing":
+            path.unlink()
+        case "a pickle":  # is never opened
+            np.savez(path, qpos=np.array([{"any": "object"}], dtype=object))
+        case text:
+            path.write_text("" if text == "empty" else text)
     with raises(ValueError, "scenes.worlds.spec.load_trajectory", "plinko-0001.npz"):
-        load_trajectory(tmp_path / "plinko-0001.npz", digest)
-
-
-@pytest.mark.parametrize("damage", [b"", b"no archive", None])
-def test_an_unreadable_trajectory_is_named_with_the_remedy(tmp_path: Path, damage: bytes | None) -> None:
-    save_trajectory(tmp_path, "plinko-0001", QPOS, QPOS)
-    digest = trajectory_digest(QPOS)
-    path = tmp_path / "plinko-0001.npz"
-    path.write_bytes(path.read_bytes()[:-30] if damage is None else damage)
-    with raises(ValueError, "scenes.worlds.spec.load_trajectory", "plinko-0001.npz"):
-        load_trajectory(path, digest)
-
-
-def test_a_pickle_is_never_opened(tmp_path: Path) -> None:
-    np.savez(tmp_path / "evil.npz", qpos=np.array([{"any": "object"}], dtype=object))
-    with raises(ValueError, "scenes.worlds.spec.load_trajectory", "evil.npz"):
-        load_trajectory(tmp_path / "evil.npz", "0")
-
-
-def test_a_missing_trajectory_is_named(tmp_path: Path) -> None:
-    with raises(ValueError, "scenes.worlds.spec.load_trajectory", "gone.npz"):
-        load_trajectory(tmp_path / "gone.npz", "0")
+        load_trajectory(path, trajectory_digest(QPOS))
 
 
 def test_the_scene_hash_covers_what_the_clips_show_and_nothing_else() -> None:

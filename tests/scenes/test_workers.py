@@ -19,33 +19,11 @@ def who(job: int) -> int:
     return os.getpid()
 
 
-def test_each_call_has_workers_of_its_own_unless_they_are_kept() -> None:
-    first, second = ({pid for _, pid in run_in_order(who, range(3), 1)} for _ in range(2))
-    assert len(first) == len(second) == 1 and first.isdisjoint(second)
-    with kept_workers():
-        third, fourth = ({pid for _, pid in run_in_order(who, range(3), 1)} for _ in range(2))
-        assert len(third) == 1 and third == fourth and third.isdisjoint(first | second)
-        (kept,) = third
-    with pytest.raises(ProcessLookupError):
-        os.kill(kept, 0)
-
-
 def test_a_worker_gives_way_after_so_many_jobs_also_where_it_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "JOBS_A_WORKER", 3)
     with kept_workers():
         pids = [pid for jobs in (2, 5) for _, pid in run_in_order(who, range(jobs), 1)]
     assert pids == [pids[0]] * 3 + [pids[3]] * 3 + [pids[6]] and len(set(pids)) == 3
-
-
-def test_jobs_are_taken_late_and_at_once_means_before_a_result_is_dealt_with() -> None:
-    def taken(*, at_once: bool) -> list[int]:
-        """How many jobs are taken when each result is there."""
-        source: list[int] = []
-        jobs = (source.append(job) or job for job in range(4))
-        return [len(source) for _ in run_in_order(who, jobs, 1, at_once=at_once)]
-
-    assert taken(at_once=False) == [1, 2, 3, 4]
-    assert taken(at_once=True) == [2, 3, 4, 4]
 
 
 def test_after_a_worker_died_the_next_call_has_others_and_after_an_early_stop_the_same() -> None:

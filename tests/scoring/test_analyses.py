@@ -8,7 +8,6 @@ from tests.build.errors import raises
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
-    degenerate_strategies,
     hidden_against_others,
     models_of,
     naive_gap,
@@ -105,22 +104,12 @@ def test_the_pooled_gap_is_a_ratio_of_means_and_a_gap_over_zero_is_infinite():
     assert gaps["gap"].to_dict() == pytest.approx({"occlusion": 2.0, "chaotic": np.inf, "pooled": 0.35 / 0.05})
 
 
-def test_a_gap_of_nothing_over_nothing_is_null():
-    frame = cells(cell(abs_rec=0.0), cell(dataset="occlusion_ill_posed", abs_rec=0.0))
-    assert visual_textual_gap(frame)["gap"].isna().all()
-
-
 def test_the_frontier_keeps_equals_and_drops_whoever_is_beaten_in_one_and_not_better_in_the_other():
     frame = cells(
         cell("a", acc=0.9, abs_rec=0.5), cell("b", acc=0.9, abs_rec=0.4), cell("c", acc=0.5, abs_rec=0.9),
         cell("twin", acc=0.5, abs_rec=0.9), cell("d", acc=0.4, abs_rec=0.8),
     )  # fmt: skip
     assert list(pareto_frontier(frame)["model"]) == ["a", "c", "twin"]
-
-
-def test_a_model_without_acc_is_not_on_the_frontier():
-    frame = cells(cell("a", acc=0.9), cell("silent", acc=np.nan, abs_rec=0.9))
-    assert list(pareto_frontier(frame)["model"]) == ["a"]
 
 
 def test_the_naive_gap_counts_cells_strictly_above_the_threshold():
@@ -173,12 +162,6 @@ def test_a_single_run_has_no_deviation_rather_than_one_of_0():
     assert spread(study_cells(board)).iloc[0].tolist() == pytest.approx([0.04, 0.04, 0.04, 1])
 
 
-def test_every_degenerate_strategy_scores_zero():
-    table = degenerate_strategies()
-    assert len(table) == 6
-    assert (table["pecs"] == 0).all()
-
-
 def scoped(scope, regime, dataset, abs_rec, run=1, **other):
     return {
         **cell(dataset=dataset, regime=regime, abs_rec=abs_rec), "run": run, "scope": scope,
@@ -224,17 +207,6 @@ def test_both_sides_of_a_sub_scenarios_ratio_are_of_the_same_models():
     ]
     table = accuracy_by_label(scoped_cells(pd.DataFrame(labels), "label"))
     assert table[["acc", "n_models"]].values.tolist() == [[0.4, 1]]
-
-
-def test_runs_of_several_epochs_name_each_of_them_once():
-    runs = [scoped("label:dice/red", "standard", "chaotic", 0.1, run=k, epoch=e) for k, e in ((1, "e1"), (2, "e1+e2"))]
-    assert scoped_cells(pd.DataFrame(runs), "label")["epoch"].tolist() == ["e1+e2"]
-
-
-def test_a_sub_scenario_without_a_figure_leaves_no_mean_of_its_kind():
-    table = pd.DataFrame({"sub_scenario": ["hidden_drop", "hidden_race", "catch"], "abs_rec": [0.2, np.nan, 0.4]})
-    means = hidden_against_others(table, ["abs_rec"]).set_index("kind")
-    assert means["abs_rec"].isna().to_dict() == {"hidden": True, "other": False}
 
 
 def test_hidden_sub_scenarios_against_the_others_as_published():

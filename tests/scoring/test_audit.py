@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.cli import main
-from traps_pipeline.scoring.audit import _same_words, audit, counts_text
+from traps_pipeline.scoring.audit import audit, counts_text
 from traps_pipeline.scoring.claims import CLAIMS
 from traps_pipeline.scoring.published import published
 
@@ -24,13 +24,6 @@ def test_the_counts_are_the_documented_ones(findings):
     }
     documented = " ".join((Path(__file__).parents[2] / "docs" / "scoring.md").read_text().split())
     assert counts_text(findings) in documented
-
-
-def test_a_statement_agrees_only_with_the_same_numbers_and_the_same_names():
-    assert _same_words("gemini-3.1-pro 0.568", "gemini-3.1-pro 0.5683")
-    assert not _same_words("gemini-3.1-pro 0.568", "gemini-3.1-pro-r-low 0.568")
-    assert not _same_words("gemini-3.1-pro-r-low 0.568", "gemini-3.1-pro 0.568")
-    assert not _same_words("gpt-5-pro", "gpt-5-pro; gpt-5-mini")
 
 
 def test_every_printed_probe_mean_follows_from_its_four_pairs(findings):
@@ -55,10 +48,6 @@ def test_a_defect_is_counted_once_and_a_declared_difference_is_not_a_defect(find
         "records"
     )
     assert (above["verdict"], above["published"], above["recomputed"]) == ("differs", "70", "71.25")
-
-
-def test_every_statement_has_the_line_that_it_comes_from(findings):
-    assert findings["line"].str.fullmatch(r"\d+( and \d+)?").all()
 
 
 def test_every_published_claim_is_decided(findings):
@@ -87,11 +76,6 @@ def test_the_cell_behind_it_is_the_only_one_whose_factors_do_not_give_its_pecs(f
     assert list(factors["statement"]) == ["PECS of llava-next-video-7b, chaotic, json"]
     # With Acc x J of its factors in its place the overall figure is the printed one.
     assert round((0.013 + 0.013 + 0.244 * (0.098 - 0.021) + 0.056) / 4, 3) == 0.025
-
-
-def test_two_printed_transfer_types_contradict_the_definitions(findings):
-    types = findings[(findings["group"] == "transfer types") & (findings["verdict"] == "differs")]
-    assert [s.rsplit("of ")[-1] for s in types["statement"]] == ["oc_ip to oc", "ch_ip to ch"]
 
 
 def test_the_command_prints_claims_and_discrepancies_and_writes_all_findings(tmp_path, capsys):

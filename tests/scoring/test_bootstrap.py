@@ -43,17 +43,6 @@ def test_a_shares_interval_is_that_of_clopper_and_pearson(yes, n, rows):
     assert share_interval(rows, yes, n) == pytest.approx(proportion_confint(yes, n, method="beta"), abs=0.012)
 
 
-def test_intervals_narrow_with_more_scenarios_and_are_never_of_no_width(rows):
-    widths = [high - low for low, high in (share_interval(rows, n, n, 1000) for n in (1, 2, 4, 8, 32, 128))]
-    assert widths == sorted(widths, reverse=True)
-    assert 0 < widths[-1] < 0.04 < 0.9 < widths[0]
-
-
-def test_right_and_wrong_exchanged_reflect_the_interval(rows):
-    (low, high), (other_low, other_high) = share_interval(rows, 5, 20), share_interval(rows, 15, 20)
-    assert (low, high) == pytest.approx((1 - other_high, 1 - other_low), abs=0.01)
-
-
 def test_the_oracles_interval_ends_at_one_and_has_a_width(rows, strategy):
     table = pecs_intervals(everywhere(rows, strategy("oracle", 30)), resamples=500)
     assert list(table.columns) == [*ENTRY, *INTERVAL_COLUMNS]
@@ -133,11 +122,6 @@ def test_items_that_are_not_decided_are_no_evidence(rows):
 
 def test_a_cell_without_any_decision_has_no_interval(rows):
     assert np.isnan(interval(pecs_intervals(rows([(None, None, None)] * 3), 50))).all()
-
-
-def test_overall_is_null_unless_all_four_datasets_are_present(rows):
-    three = pd.concat([rows(random_pairs(10, 1), dataset=d) for d in DATASETS[:3]], ignore_index=True)
-    assert np.isnan(interval(pecs_intervals(three, 50), "overall")).all()
 
 
 def test_the_same_seed_gives_the_same_interval_and_another_seed_another(rows):

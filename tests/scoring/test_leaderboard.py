@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.pooled import pooled_j
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
@@ -43,10 +42,6 @@ def test_the_deviation_over_runs_divides_by_the_number_of_runs(rows):
     row = entry(board_of(pd.concat(parts, ignore_index=True)))
     assert row.acc_std == pytest.approx(np.sqrt(0.5 / 3))
     assert (row.abs_rec_std, row.false_abs_std, row.j_std) == (0.0, 0.0, 0.0)
-
-
-def test_one_run_has_deviation_zero(rows):
-    assert entry(board_of(rows([(True, False, True), (False, False, True)]))).pecs_std == 0.0
 
 
 def test_overall_weighs_datasets_equally_within_each_run(rows):
@@ -201,20 +196,6 @@ def test_nothing_scored_gives_an_empty_board(rows, tmp_path):
     TableStore(tmp_path).write(LEADERBOARD, {}, board, {})
 
 
-def test_pooled_j_and_its_standard_error(rows):
-    # AbsRec 3/4 over 2 runs x 2 voids, FalseAbs 1/4 over 2 x 2 controls: J = 0.5, se = sqrt(2 x 0.25 x 0.75 / 4).
-    runs = [rows([(True, False, True), (True, False, True)]), rows([(True, True, True), (True, False, False)], run=2)]
-    pooled = pooled_j(pd.concat(runs, ignore_index=True)).set_index("model").loc["m"]
-    assert [pooled.j, pooled.standard_error, pooled.n] == pytest.approx([0.5, np.sqrt(2 * 0.25 * 0.75 / 4), 8])
-
-
-def test_pooled_j_of_a_single_void_and_of_no_decided_void(rows):
-    one = pooled_j(rows([(True, False, True)])).iloc[0]
-    assert (one.j, one.standard_error, one.n) == (1.0, 0.0, 2)
-    none = pooled_j(rows([(True, False, None)])).iloc[0]
-    assert (np.isnan(none.j), none.n) == (True, 1)
-
-
 @pytest.mark.parametrize(
     ("figure", "low", "wrong"), [("pecs", -0.1, 1), ("j", -0.1, 0), ("j", -1.1, 1), ("acc", 0.0, 0)]
 )
@@ -225,11 +206,3 @@ def test_intervals_out_of_order_or_range_are_counted(figure, low, wrong, rows):
     assert wrong_intervals(board.assign(**{f"{figure}_ci_high": 1.1})) == 1
     assert wrong_intervals(board.assign(**{f"{figure}_ci_low": 0.6, f"{figure}_ci_high": 0.4})) == 1
     assert wrong_intervals(board.assign(**{f"{figure}_ci_low": np.nan, f"{figure}_ci_high": np.nan})) == 0
-
-
-@pytest.mark.parametrize("name", ["random-50", "confidence-noise"])
-def test_random_strategies_are_indistinguishable_from_zero(name, rows, strategy):
-    parts = [rows(strategy(name, 200, seed=k), dataset=d, model=name) for k, d in enumerate(DATASETS)]
-    pooled = pooled_j(pd.concat(parts, ignore_index=True)).iloc[0]
-    assert abs(pooled.j) < 3 * pooled.standard_error
-    assert pooled.standard_error == pytest.approx({"random-50": 0.025, "confidence-noise": 0.0229}[name], rel=0.05)

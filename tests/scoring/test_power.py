@@ -30,12 +30,6 @@ def test_the_width_of_one_dataset_follows_by_hand() -> None:
         precision({"occlusion": 0})
 
 
-def test_with_few_pairs_little_is_promised() -> None:
-    widths = [precision(everywhere(n)).width for n in (1, 2, 4, 16, 64)]
-    assert widths == sorted(widths, reverse=True) and widths[0] > 0.5
-    assert precision({"occlusion": 2}).difference is None and precision(everywhere(2)).difference is None
-
-
 def test_a_model_that_never_varies_has_a_width_all_the_same() -> None:
     assert 0.1 < precision(everywhere(16), Shares(1.0, 1.0, 0.0)).width < 0.5
 

@@ -8,7 +8,7 @@ import dagster as dg
 import jinja2
 import pytest
 
-from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import CHROMIUM, a_browser
 from traps_pipeline.base.terminal import visible
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.report.explorer.site import WEB
@@ -53,17 +53,13 @@ def test_metadata_for_dagster_holds_no_hidden_character() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which(CHROMIUM) is None, reason="chromium is not installed")
 def test_scripts_and_templates_agree_on_every_character() -> None:
-    from playwright.sync_api import sync_playwright
-
     script = (WEB / "dom.js").read_text(encoding="utf-8")
     texts = [f"a{chr(code)}b" for code in range(0x110000) if not 0xD800 <= code < 0xE000]
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+    with a_browser() as browser:
         page = browser.new_page()
         page.add_script_tag(content=script)
         changed = page.evaluate("texts => texts.map(visible).filter((text, k) => text !== texts[k])", texts)
         assert page.evaluate("visible", HOSTILE) == VISIBLE and page.evaluate("visible", EMOJI) == EMOJI
         # A text that no script treats as untrusted, as an id.
         assert page.evaluate("text => h('p', null, text).textContent", HOSTILE) == VISIBLE
-        browser.close()
     assert changed == [visible(text) for text in texts if visible(text) != text]

@@ -9,7 +9,6 @@ import pytest
 from pydantic import ValidationError
 
 from tests.build.errors import raises
-from traps_pipeline.base.digests import digest
 from traps_pipeline.models.framing import framed
 from traps_pipeline.storage.media import MediaSpec, pick, profile_digest, resized
 
@@ -21,13 +20,6 @@ def test_a_cropped_frame_keeps_its_shape_and_its_middle():
     assert resized(frame, (2, 2))[0, 0, :, 0].tolist() == [15, 35]
     with raises(ValidationError, "MediaSpec"):
         MediaSpec(profile="frames", fps=2, fit="crop")
-
-
-def test_a_profile_that_stretches_has_the_digest_that_it_had_before_clips_could_be_cropped():
-    plain = MediaSpec(profile="frames", fps=2, most=32, size=(336, 336))
-    assert profile_digest(plain) != profile_digest(plain.model_copy(update={"fit": "crop"}))
-    made = {"revision": 1, "spec": plain.model_dump(mode="json", exclude={"fit", "later"})}
-    assert profile_digest(plain) == digest(made)
 
 
 def test_frames_that_are_shown_later_are_the_next_ones_and_the_last_one_stays():

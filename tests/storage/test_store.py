@@ -131,15 +131,6 @@ def test_a_table_of_one_host_is_read_on_another(hosts: Hosts) -> None:
     assert list(other.read_all(VIDEOS, category=("plinko", "dice"))["scenario_id"]) == ["plinko-0001"]
 
 
-def test_the_bytes_of_a_table_are_the_same_wherever_it_lies(hosts: Hosts, tmp_path: Path) -> None:
-    store, alone = hosts.open("one"), TableStore(tmp_path / "alone")
-    tables = TableStore(store.root / "tables", store)
-    for each in (tables, alone):
-        each.write(VIDEOS, PLINKO, [clip("plinko-0001")], {})
-    path = tables.path(VIDEOS, PLINKO)
-    assert store.here(path).read_bytes() == alone.path(VIDEOS, PLINKO).read_bytes()
-
-
 def test_what_is_there_and_its_digests_are_known_without_its_contents(hosts: Hosts) -> None:
     one, other = hosts.open("one"), hosts.open("other")
     put(one, "clips/a/void.mp4", b"frames")

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 import pyarrow as pa
-import pytest
 
-from tests.build.errors import raises
-from tests.tables import PACKAGES, TABLES
+from tests.tables import TABLES
 from traps_pipeline.storage.tables import Table
 
 
@@ -45,33 +43,8 @@ def test_types_nulls_meanings_and_order_are_the_annotations() -> None:
     assert [column.type_name for column in PARCELS.columns] == types
 
 
-def test_a_row_is_told_in_the_words_of_its_class() -> None:
-    assert PARCELS.row == "a parcel on its way"
-
-
-@pytest.mark.parametrize("key", [{"key": ("id", "colour")}, {"partition_by": ("colour",)}])
-def test_a_key_or_partition_that_is_no_column_is_refused_by_name(key: dict[str, Any]) -> None:
-    with raises(ValueError, "storage.tables.Table.__post_init__", "parcels", "ParcelRow", "colour"):
-        Table("parcels", ParcelRow, **({"partition_by": (), "key": ()} | key))
-
-
-@pytest.mark.parametrize(
-    "annotation",
-    [str, Annotated[bytes, "a type that no file holds"], Annotated[int | str, "two types"], Annotated[None, "none"]],
-)
-def test_an_annotation_that_says_no_column_is_refused_by_name(annotation: Any) -> None:
-    row_type = dataclass(type("OddRow", (), {"__annotations__": {"size": annotation}}))
-    with raises(TypeError, "storage.tables._columns", "OddRow", "size"):
-        _ = Table("odd", row_type, partition_by=(), key=("size",)).columns
-
-
 def test_every_column_of_a_table_says_what_it_holds() -> None:
     for table in TABLES.values():
         assert table.row
         assert [field.name for field in fields(table.row_type)] == table.arrow_schema().names
         assert all(column.doc for column in table.columns), table.name
-
-
-def test_no_two_tables_share_a_name() -> None:
-    declared = [value for package in PACKAGES for value in vars(package).values() if isinstance(value, Table)]
-    assert len(declared) == len(TABLES)

@@ -85,24 +85,6 @@ def test_a_malformed_study_names_its_file_and_the_field(tmp_path: Path, text: by
         Workspace.open(tmp_path)
 
 
-def test_a_folder_without_a_study_says_how_to_make_one(tmp_path: Path) -> None:
-    with raises(TrapsError, "storage.workspace.Workspace.open", "study.yaml"):
-        Workspace.open(tmp_path)
-
-
-def test_the_workspace_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path))
-    assert Workspace.default_place() == tmp_path
-    monkeypatch.delenv("TRAPS_WORKSPACE")
-    assert Workspace.default_place().parts[-2:] == (".workspaces", "default")
-
-
-def test_paths_are_absolute_however_the_workspace_was_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert Workspace.create(Path("w"), Study()).root == tmp_path / "w"
-    assert Workspace.open(Path("w")).root == tmp_path / "w"
-
-
 def test_a_clip_of_another_scene_has_another_path_and_tables_store_it_relative(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path, Study())
     one, two = (workspace.clip("plinko-0001", "void", digit * 64) for digit in "ab")
