@@ -16,13 +16,11 @@ from traps_pipeline.cli.command import SHORT, Parser
 PAGE = ROOT / "docs" / "commands.md"
 HEAD = """# Commands
 
-For everyone who types `traps`. After this page you know every command and option. `--help` shows the same;
-`python -m tests.commands_page` writes this page from the parser.
+For everyone who types `traps`: every command and option. `--help` shows the same, with an example; `python -m
+tests.commands_page` writes this page from the parser.
 
-- Most commands work in a study: `--workspace` names its folder or s3:// address (default: `$TRAPS_WORKSPACE`, else
-  `.workspaces/default`).
-- Results go to standard output, progress and errors to standard error. [Headless use](ci.md#exit-codes) lists the exit
-  codes.
+- `--workspace` names the study's folder or s3:// address (default: `$TRAPS_WORKSPACE`, else `.workspaces/default`).
+- Results go to standard output, progress and errors to standard error, [exit codes](ci.md#exit-codes) to scripts.
 - {short} need no group: `traps run` is `traps study run`.
 - `eval "$(traps completion bash)"` lets bash complete commands, options and experiments; for zsh write `zsh`.
 
@@ -43,20 +41,18 @@ def page() -> str:
     common = {row: None for row, count in counts.items() if count >= COMMANDS_OF_A_COMMON_ARGUMENT}
     short = ", ".join(f"`{name}`" for name in SHORT)
     parts = [HEAD.format(short=short, common="\n".join(common))]
-    for group, text in [*GROUPS.items(), ("", "")]:
+    for group in (*GROUPS, ""):
         own = {path: each for path, each in parser.commands.items() if path.rpartition(" ")[0] == group}
-        parts += [f"## {group.capitalize() or 'Shell'}\n", *([f"To {text}.\n"] if text else [])]
-        parts += [_section(path, each, {*common}) for path, each in own.items()]
+        parts += [f"## {group.capitalize() or 'Shell'}\n", *(_section(*each, {*common}) for each in own.items())]
     return "\n".join(parts)
 
 
 def _section(path: str, parser: Parser, common: set[str]) -> str:
-    (example,) = (line for line in (parser.epilog or "").splitlines() if line.startswith("example: "))
     text = f"{parser.description}".rstrip(".")
     rows = [*_rows(parser)]
     shared = ", ".join(row.split("`")[1].split(" ")[0] for row in rows if row in common)
-    also = f" Also takes `{shared.replace(', ', '`, `')}`." if shared else ""
-    lines = [f"### traps {path}\n", f"{text[0].upper()}{text[1:]}.{also} Example: `{example[9:].strip()}`\n"]
+    also = f" Also `{shared.replace(', ', '`, `')}`." if shared else ""
+    lines = [f"### traps {path}\n", f"{text[0].upper()}{text[1:]}.{also}\n"]
     own = [row for row in rows if row not in common]
     return "\n".join([*lines, *([*own, ""] if own else [])])
 

@@ -11,10 +11,9 @@ DATA, PAGE = ROOT / "docs" / "paper.csv", ROOT / "docs" / "paper.md"
 STATUSES = ("there", "departs", "missing")
 HEAD = """# The paper, item by item
 
-For readers of the paper. After this page you know what differs here, and where each item is implemented.
-
-[paper.csv](paper.csv) lists all items: line in the paper's LaTeX source, file, test, status, note. A test fails where a
-named file or test does not exist. `python -m tests.paper_items` writes this page, which has only the departures.
+For readers of the paper: what differs here. [paper.csv](paper.csv) lists all items: line in the paper's LaTeX source,
+file, test, status, note. A test fails where a named file or test does not exist; `python -m tests.paper_items` writes
+this page.
 
 """
 
@@ -40,9 +39,8 @@ def page() -> str:
 
 
 def _line(row: dict[str, str]) -> str:
-    place = f" (`{row['place']}`)" if row["place"] else ""
     note = f": {row['note']}" if row["note"] else ""
-    return f"- **{row['n']}** {row['item']}{place}{note}\n"
+    return f"- **{row['n']}** {row['item']}{note}\n"
 
 
 if __name__ == "__main__":

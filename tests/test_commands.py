@@ -13,6 +13,7 @@ import pytest
 
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.conftest import ROOT
+from tools.docs_hooks import NOTEBOOK, notebook_page
 from traps_pipeline.cli import GROUPS, build_parser
 from traps_pipeline.cli.command import SHORT
 from traps_pipeline.definitions import defs
@@ -77,6 +78,8 @@ def name(words: list[str]) -> str:
 
 COMMANDS = [(page, words, True) for page in PAGES for words in in_blocks(page.read_text())]
 COMMANDS += [(page, words, False) for page in PAGES for words in in_spans(page.read_text())]
+COMMANDS += [(NOTEBOOK, words, True) for words in in_blocks(notebook_page())]
+COMMANDS += [(NOTEBOOK, words, False) for words in in_spans(notebook_page())]
 # What the package's errors and help tell to type; a value that is only known then stands in braces.
 TOLD = [re.sub(r"\{[^{}]*\}", "X", path.read_text()) for path in (ROOT / "traps_pipeline").rglob("*.py")]
 COMMANDS += [(ROOT / "traps_pipeline", words, False) for text in TOLD for words in in_spans(text)]

@@ -1,12 +1,14 @@
 """What mkdocs does for this project beyond its settings: README as the first page, files that pages link to, reference.
 
 A page of `docs/` links to the rest of the repository (`../CONTRIBUTING.md`); on the site such a file lies below
-`repository/`. The reference is written from the docstrings of the package, a page a room, without importing it.
+`repository/`. The reference is written from the docstrings of the package, a page a room, without importing it. The
+notebook becomes a page with what its cells printed and drew.
 """
 
 from __future__ import annotations
 
 import ast
+import json
 import posixpath
 import re
 from collections.abc import Iterator
@@ -17,6 +19,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "traps_pipeline"
+NOTEBOOK, NOTEBOOK_PAGE = ROOT / "docs" / "inside.ipynb", "inside.md"
 LINK = re.compile(r"(\]\()(?!\w+:|#)([^)\s#]+)")
 OUTSIDE = "repository"
 
@@ -34,6 +37,7 @@ def on_files(files: Files, config: Any) -> Files:
     for path in sorted(seen):
         if not path.is_relative_to(ROOT / "docs"):  # mkdocs finds these itself
             files.append(File.generated(config, _place(path), content=path.read_bytes()))
+    files.append(File.generated(config, NOTEBOOK_PAGE, content=notebook_page()))
     for name, text in reference().items():
         files.append(File.generated(config, f"reference/{name}.md", content=text))
     return files
@@ -63,6 +67,8 @@ def _place(path: Path) -> str:
     """Return where a file of the repository lies on the site."""
     if path == ROOT / "README.md":
         return "index.md"
+    if path == NOTEBOOK:
+        return NOTEBOOK_PAGE
     if path.is_relative_to(ROOT / "docs"):
         return path.relative_to(ROOT / "docs").as_posix()
     return f"{OUTSIDE}/{path.relative_to(ROOT).as_posix()}"
@@ -75,6 +81,20 @@ def _source(place: str) -> Path | None:
     if place.startswith("reference/"):
         return None
     return ROOT / place.removeprefix(f"{OUTSIDE}/") if place.startswith(f"{OUTSIDE}/") else ROOT / "docs" / place
+
+
+def notebook_page() -> str:
+    """Return the notebook as Markdown: its texts, and its code with what each cell printed and drew."""
+    parts = []
+    for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", ()):
+            if output["output_type"] == "stream":
+                parts.append(f"```text\n{''.join(output['text'])}```")
+            else:
+                parts.append(f"![what the cell draws](data:image/png;base64,{output['data']['image/png']})")
+    return "\n\n".join(parts) + "\n"
 
 
 # --- the reference ----------------------------------------------------------------------------------------------------

@@ -1,39 +1,26 @@
-"""docs/inside.ipynb from docs/inside.md, cell by cell, with what each cell printed and drew: run
-`python -m tools.inside_notebook` where the page's study is.
-
-A block of Python is a code cell; what stands between two is a text cell.
-"""
+"""Run docs/inside.ipynb where its study is, and keep what each cell printed and drew:
+`python -m tools.inside_notebook`."""
 
 from __future__ import annotations
 
 import base64
 import io
 import json
-import re
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base.digests import digest
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
-_BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+NOTEBOOK = Path(__file__).resolve().parent.parent / "docs" / "inside.ipynb"
 
 
-def cells(page: str) -> list[dict[str, Any]]:
-    """Return the cells (nbformat 4.5, without outputs) of a page of Markdown."""
-    parts = _BLOCK.split(page)  # text, code, text, code, ...
-    return [_cell(number, part.strip("\n")) for number, part in enumerate(parts) if part.strip()]
+def identity(source: list[str]) -> str:
+    """Return the id of a cell that was run as it stands."""
+    return digest("".join(source))[:12]
 
 
-def _cell(number: int, text: str) -> dict[str, Any]:
-    common = {"id": digest([number, text])[:12], "metadata": {}, "source": text.splitlines(keepends=True)}
-    if number % 2:
-        return {"cell_type": "code", **common, "execution_count": None, "outputs": []}
-    return {"cell_type": "markdown", **common}
-
-
-def execute(made: list[dict[str, Any]]) -> dict[str, Any]:
+def execute(cells: list[dict[str, Any]]) -> dict[str, Any]:
     """Run the code cells one after another and fill in their outputs; returns the names that they define."""
     import matplotlib as mpl
 
@@ -41,7 +28,7 @@ def execute(made: list[dict[str, Any]]) -> dict[str, Any]:
     import matplotlib.pyplot as plt
 
     names: dict[str, Any] = {}
-    code = [cell for cell in made if cell["cell_type"] == "code"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
     for count, cell in enumerate(code, start=1):
         with redirect_stdout(io.StringIO()) as printed:
             exec(compile("".join(cell["source"]), f"cell {count}", "exec"), names)
@@ -58,16 +45,13 @@ def execute(made: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the page and write the notebook beside it."""
-    notebook_cells = cells((DOCS / "inside.md").read_text(encoding="utf-8"))
-    execute(notebook_cells)
-    about = {
-        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-        "language_info": {"name": "python"},
-    }
-    notebook = {"cells": notebook_cells, "metadata": about, "nbformat": 4, "nbformat_minor": 5}
+    """Run the notebook in place."""
+    notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
+    execute(notebook["cells"])
+    for cell in notebook["cells"]:
+        cell["id"] = identity(cell["source"])
     text = json.dumps(notebook, ensure_ascii=False, indent=1) + "\n"
-    (DOCS / "inside.ipynb").write_text(text, encoding="utf-8", newline="\n")
+    NOTEBOOK.write_text(text, encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":

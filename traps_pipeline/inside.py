@@ -7,7 +7,7 @@
     with inside.direction(".workspaces/mechanism", "pocket", "occlusion", layer=3).apply(network, gaps=-1):
         network.generate(...)                                          # a plain transformers model
 
-docs/inside.md walks through this; a test runs that page.
+docs/inside.ipynb walks through this; a test runs it.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import json
 from itertools import product
 
 import numpy as np
@@ -15,9 +15,8 @@ from sklearn.preprocessing import StandardScaler
 
 from tests.build.mechanism import STANDARD, entry, patch
 from tests.build.mechanism import study as extracted
-from tests.conftest import ROOT
 from tests.mechanism.study import PAIRS, write_verdicts
-from tools.inside_notebook import cells, execute
+from tools.inside_notebook import NOTEBOOK, execute
 from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
@@ -48,12 +47,12 @@ def study(extracted: Workspace) -> Workspace:
     return extracted
 
 
-def test_the_page_runs_as_it_is_written(study: Workspace) -> None:
-    page = (ROOT / "docs" / "inside.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+def test_the_notebook_runs_as_it_is_written(study: Workspace) -> None:
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    blocks = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     code = "\n".join(blocks).replace('".workspaces/mechanism"', repr(str(study.root))).replace('"pocket"', '"tiny"')
     assert len(blocks) >= 6
-    names = execute(cells(f"```python\n{code}```\n"))
+    names = execute([{"cell_type": "code", "source": [code]}])
     assert not torch.equal(names["pushed"], names["plain"])  # type: ignore[arg-type]
 
 

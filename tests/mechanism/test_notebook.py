@@ -1,35 +1,39 @@
-"""The notebook of docs is its page, cell by cell, with outputs; `test_inside` runs the page's blocks."""
+"""The notebook of docs has what its cells print and draw; `test_inside` runs it on another study."""
 
 from __future__ import annotations
 
 import json
+from typing import Any
 
-from tests.conftest import ROOT
-from tools.inside_notebook import cells, execute
-
-DOCS = ROOT / "docs"
+from tools.docs_hooks import notebook_page
+from tools.inside_notebook import NOTEBOOK, execute, identity
 
 
-def test_the_notebook_is_its_page_with_what_every_cell_printed_and_drew() -> None:
-    page = (DOCS / "inside.md").read_text(encoding="utf-8")
-    written = json.loads((DOCS / "inside.ipynb").read_text(encoding="utf-8"))
+def test_every_cell_of_the_notebook_was_run_as_it_stands_and_keeps_what_it_printed_and_drew() -> None:
+    written = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     code = [cell for cell in written["cells"] if cell["cell_type"] == "code"]
     pictures = [output for cell in code for output in cell["outputs"] if output["output_type"] == "display_data"]
     assert all(cell["outputs"] for cell in code) and len(pictures) >= 3
     assert [cell["execution_count"] for cell in code] == [*range(1, len(code) + 1)]
-    plain = [
-        cell | ({"outputs": [], "execution_count": None} if cell["cell_type"] == "code" else {})
-        for cell in written["cells"]
-    ]
-    assert plain == cells(page), "docs/inside.md was changed: run `python -m tools.inside_notebook`"
+    changed = [cell["source"][0] for cell in written["cells"] if cell["id"] != identity(cell["source"])]
+    assert not changed, "cells were changed: run `python -m tools.inside_notebook`"
     assert (written["nbformat"], written["nbformat_minor"]) == (4, 5)
 
 
-def test_a_page_by_hand_is_run_and_what_it_prints_and_draws_is_kept() -> None:
-    made = cells("# One\n\n```python\na = 1\nprint(a)\n```\n\n```\nno python\n```\n\n```python\na = a + 1\n"
-                 "import matplotlib.pyplot as plt\nplt.plot([a])\n```\n")  # fmt: skip
-    assert [cell["cell_type"] for cell in made] == ["markdown", "code", "markdown", "code"]
+def test_the_page_of_the_site_has_texts_code_output_and_pictures_in_order() -> None:
+    page = notebook_page()
+    assert page.startswith("# Look inside from a notebook\n")
+    first, printed, drawn = (page.index(part) for part in ("```python\n", "```text\n", "](data:image/png;base64,"))
+    assert first < printed < drawn and page.count("```") % 2 == 0
+
+
+def test_cells_by_hand_are_run_and_what_they_print_and_draw_is_kept() -> None:
+    made: list[dict[str, Any]] = [
+        {"cell_type": "code", "source": ["a = 1\n", "print(a)"]},
+        {"cell_type": "markdown", "source": ["no python"]},
+        {"cell_type": "code", "source": ["a = a + 1\n", "import matplotlib.pyplot as plt\n", "plt.plot([a])"]},
+    ]
     assert execute(made)["a"] == 2
-    assert made[1]["outputs"] == [{"output_type": "stream", "name": "stdout", "text": ["1\n"]}]
-    (picture,) = made[3]["outputs"]
-    assert picture["data"]["image/png"].startswith("iVBOR") and made[3]["execution_count"] == 2
+    assert made[0]["outputs"] == [{"output_type": "stream", "name": "stdout", "text": ["1\n"]}]
+    (picture,) = made[2]["outputs"]
+    assert picture["data"]["image/png"].startswith("iVBOR") and made[2]["execution_count"] == 2

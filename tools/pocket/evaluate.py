@@ -200,6 +200,6 @@ def markdown(cells: Sequence[AnswerCounts]) -> str:
 
 
 def _spread(shares: Sequence[float]) -> str:
-    """Return the shares in percent: one value, or the mean of several with the lowest and the highest."""
-    mean = f"{100 * np.mean(shares):.1f}"
-    return mean if len(shares) == 1 else f"{mean} ({100 * min(shares):.1f}-{100 * max(shares):.1f})"
+    """Return the shares in percent: their mean and, where they differ, the lowest and the highest."""
+    mean, low, high = (f"{100 * value:.1f}" for value in (np.mean(shares), min(shares), max(shares)))
+    return mean if low == high else f"{mean} ({low}-{high})"

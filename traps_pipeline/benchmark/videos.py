@@ -21,7 +21,7 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
 CLIPS = ("control", "void", "twin")
-SECONDS_A_CLIP = 1.4  # of one core, measured (docs/design/cluster-results.md)
+SECONDS_A_CLIP = 1.4  # of one core, measured (docs/engineering-notes.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
