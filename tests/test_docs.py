@@ -94,10 +94,12 @@ def test_the_verbatim_prompts_carry_the_licence_of_the_papers_release() -> None:
     rows = [row for row in listed.splitlines() if row.startswith("|") and ".txt" in row]
     whose = {name: "verbatim" in row for row in rows for name in re.findall(r"\w+\.txt", row)}
     assert set(whose) == {path.name for path in (ROOT / "assets/prompts").glob("*.txt")}
-    adapted = ["json_answer_suffix.txt", "json_abstain_suffix.txt"]  # so they carry that licence, too
+    # They carry that licence, too.
+    adapted = ["json_answer_suffix.txt", "json_abstain_suffix.txt", "probabilities_suffix.txt"]
     assert [name for name, verbatim in whose.items() if not verbatim] == [
         "judge_confabulation.txt",
         "judge_premise_suffix.txt",
+        "priced_suffix.txt",
         *adapted,
     ]
     for name in ("assets/prompts/README.md", "LICENSE-DATA", "README.md", "docs/limits.md"):
