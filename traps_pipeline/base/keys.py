@@ -79,7 +79,15 @@ def check_address(address: str) -> str:
     return address
 
 
+def check_variable(name: str) -> str:
+    """Return the name itself. Raises ValueError, which does not repeat it, where it may be the key."""
+    if not re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
+        raise ValueError("is the name of the environment variable that holds a key, such as MY_KEY, not the key itself")
+    return name
+
+
 Address = Annotated[str, AfterValidator(check_address)]
+Variable = Annotated[str, AfterValidator(check_variable)]
 
 
 def _problem(value: str) -> str:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.keys import Address, check_parameters, read_key
+from traps_pipeline.base.keys import Address, Variable, check_parameters, read_key
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
@@ -63,7 +63,7 @@ class Account(BaseModel):
     """Where calls go and what they share: the key's variable, the address, calls and tokens a minute."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    key: str | None = Field(default=None, pattern=r"^[A-Z][A-Z0-9_]*$", description="environment variable of the key")
+    key: Variable | None = Field(default=None, description="environment variable of the key")
     base_url: Address | None = Field(default=None, description="of an OpenAI-compatible endpoint")
     batch_price: float = Field(
         default=1.0, gt=0, le=1, description="price of a call in a batch, relative to a live one"
