@@ -13,7 +13,7 @@ import pytest
 
 from tests.build.errors import raises
 from tests.conftest import ROOT
-from tests.scenes.released import Released
+from tests.scenes.released import SIX, Released
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
@@ -150,7 +150,14 @@ def test_a_hidden_element_that_follows_what_is_seen_is_refused_before_anything_i
     assert not (tmp_path / "released").exists()
 
 
-@pytest.mark.parametrize("name", [name for name in registry.family_names() if registry.get_family(name).twins])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in SIX))
+        for name in registry.family_names()
+        if registry.get_family(name).twins
+    ],
+)
 def test_no_familys_hidden_element_goes_with_what_is_seen(name: str) -> None:
     assert registry.fit_to_sample(name).name == name
 

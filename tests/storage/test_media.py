@@ -200,13 +200,13 @@ def test_the_sent_video_has_the_picked_frames_and_looks_like_the_source(
 ) -> None:
     made = store.prepare(*clip, VIDEO)
     assert made.path is not None
-    frames, times = decode(made.path)
-    assert len(frames) == made.n_frames == 25 and made.fps == 5
+    sent, times = decode(made.path)
+    assert len(sent) == made.n_frames == 25 and made.fps == 5
     assert times == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
     assert made.times_s == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
-    assert [shown(frame) for frame in frames] == list(range(0, 50, 2))
+    assert [shown(frame) for frame in sent] == list(range(0, 50, 2))
     for source in (sample(clip[0], VIDEO).frames, np.stack(frames(50, step=2)[::2])):
-        error = ((frames.astype(float) - source) ** 2).mean(axis=(1, 2, 3))
+        error = ((sent.astype(float) - source) ** 2).mean(axis=(1, 2, 3))
         assert (10 * np.log10(255**2 / error) > 30).all()  # dB
     assert made.sha256 == file_digest(made.path) and made.size_bytes == made.path.stat().st_size
     assert payload(made) == [made.path.read_bytes()]
