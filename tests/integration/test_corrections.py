@@ -65,7 +65,9 @@ TICK = """
 import dagster as dg
 from traps_pipeline.definitions import defs
 sensor = defs.get_repository_def().get_sensor_def("follow_corrections")
-with dg.DagsterInstance.get() as history, dg.build_sensor_context(history, definitions=defs) as context:
+with dg.DagsterInstance.get() as history, dg.build_sensor_context(
+    history, definitions=defs, resources=defs.resources
+) as context:
     print(len(sensor.evaluate_tick(context).run_requests))
 """
 

@@ -11,7 +11,6 @@ from traps_pipeline.report.tables.table_columns import DATASET, MODEL, titled
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.analyses import models_of
-from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text
 from traps_pipeline.scoring.published import as_printed
 
 if TYPE_CHECKING:
@@ -312,6 +311,8 @@ def _paths(rows: pd.DataFrame) -> pd.DataFrame:
 @cache
 def audit_table() -> PrintedTable:
     """Return every statement that differs from what the paper's tables give, with its line and the arithmetic."""
+    from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text  # pandas takes long to import
+
     findings = audit()
     rows = findings.loc[findings["verdict"].isin([DIFFERS, DECLARED])].reset_index(drop=True)
     columns = [
