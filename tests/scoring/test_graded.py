@@ -154,6 +154,6 @@ def test_stated_probabilities_are_acted_on_at_the_price_and_an_undecided_answer_
 
 
 def test_without_graded_cuts_there_is_no_row() -> None:
-    nothing = [pd.DataFrame(columns=pd.Index(one.names)) for one in (VERDICTS, VOTES, RESPONSES)]
-    made = graded(*nothing, {}, resamples=10)
+    verdicts, votes, responses = (pd.DataFrame(columns=pd.Index(one.names)) for one in (VERDICTS, VOTES, RESPONSES))
+    made = graded(verdicts, votes, responses, {}, resamples=10)
     assert made.empty and wrong_rows(made) == 0

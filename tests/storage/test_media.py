@@ -205,7 +205,8 @@ def test_the_sent_video_has_the_picked_frames_and_looks_like_the_source(
     assert times == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
     assert made.times_s == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
     assert [shown(frame) for frame in sent] == list(range(0, 50, 2))
-    for source in (sample(clip[0], VIDEO).frames, np.stack(frames(50, step=2)[::2])):
+    drawn = np.stack(frames(50, step=2)[::2])
+    for source in (sample(clip[0], VIDEO).frames, drawn):
         error = ((sent.astype(float) - source) ** 2).mean(axis=(1, 2, 3))
         assert (10 * np.log10(255**2 / error) > 30).all()  # dB
     assert made.sha256 == file_digest(made.path) and made.size_bytes == made.path.stat().st_size

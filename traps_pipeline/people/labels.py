@@ -47,10 +47,13 @@ class ClipLabel(BaseModel):
 
 
 # Of the other tasks, a person states the decisions alone.
+_model: Any = create_model  # its fields are known at run time alone
 LABELS: Mapping[TaskName, type[BaseModel]] = {
-    task: create_model(task, __config__=_STRICT, **dict[str, Any].fromkeys(DECISIONS[task], (StrictBool, ...)))
+    task: ClipLabel
+    if task == "answerability"
+    else _model(task, __config__=_STRICT, **dict.fromkeys(DECISIONS[task], (StrictBool, ...)))
     for task in TASKS
-} | {"answerability": ClipLabel}
+}
 
 
 class Line(BaseModel):

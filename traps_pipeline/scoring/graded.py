@@ -56,8 +56,9 @@ class Asked:
             if not isinstance(entry, dict):
                 return None
             label, number = to_label(str(entry.get("answer")), self.labels, self.aliases), entry.get("probability")
-            is_number = isinstance(number, int | float) and not isinstance(number, bool)
-            if label is None or label in stated or not (is_number and 0 <= number <= 1):
+            if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number <= 1:
+                return None
+            if label is None or label in stated:
                 return None
             stated[label] = number
         others = [label for label in self.labels if label not in stated]

@@ -203,5 +203,7 @@ def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
         )
         for row in workspace.tables.read_all(ITEMS, dataset=GRADED).to_dict("records")
     }
-    parts = (current_rows(workspace, table, dataset=GRADED) for table in (VERDICTS, VOTES, RESPONSES))
-    return against_posterior(*parts, asked)
+    verdicts, votes, responses = (
+        current_rows(workspace, table, dataset=GRADED) for table in (VERDICTS, VOTES, RESPONSES)
+    )
+    return against_posterior(verdicts, votes, responses, asked)

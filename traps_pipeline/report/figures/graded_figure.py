@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from traps_pipeline.protocol.regimes import ANSWER_FROM
 from traps_pipeline.report.result_frames import Results
@@ -33,7 +33,7 @@ def graded(results: Results) -> Figure:
         ideal: dict[str, Any] = {"color": SOFT, "linewidth": 0.8, "zorder": 0.5}
         left.plot([0.3, ANSWER_FROM, ANSWER_FROM, 1], [1, 1, 0, 0], label="ideal observer", **ideal)
         right.plot([0.3, 1], [0.3, 1], **ideal)
-        for (model, regime), part in rows.sort_values("top").groupby(["model", "regime"], sort=False):
+        for (model, regime), part in cast(Any, rows.sort_values("top").groupby(["model", "regime"], sort=False)):
             k = models.index(model)
             look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
             look |= {"linestyle": lines[str(regime)], "markersize": 4, "clip_on": False}
