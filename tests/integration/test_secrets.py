@@ -19,14 +19,25 @@ from tests.conftest import KEY, ROOT, Checkout, Finished
 pytestmark = pytest.mark.slow
 
 CORE = "sk-pL4nt3dQz93XwJk20vB"
-# tests/base/test_keys.py has every form that is refused, tests/base/test_redaction.py every form that is blanked.
 REFUSED = {
     "line break": f"{CORE}\n",
+    "carriage return": f"{CORE}\r",
+    "space after": f"{CORE} ",
+    "space before": f" {CORE}",
+    "tab": f"{CORE[:9]}\t{CORE[9:]}",
     "control character": f"{CORE}\x1b",
+    "not ASCII": f"{CORE}ä",
     "no Unicode": f"{CORE}\udce4",
+    "two lines": f"{CORE}\n{CORE[::-1]}",
     "quotes": f'"{CORE}"',
 }
-TAKEN = {"plain": CORE, "quotes and dollars": f"{CORE}'$\"`", "percent signs": f"%41{CORE}%25%"}
+TAKEN = {
+    "plain": CORE,
+    "quotes and dollars": f"{CORE}'$\"`",
+    "percent signs": f"%41{CORE}%25%",
+    "base64": b64encode(CORE.encode()).decode(),
+    "very long": CORE * 150,
+}
 KINDS = ("refusal", "server-error", "answer", "odd")  # models of the server, by what they do
 MATERIALIZE = "asset materialize -m traps_pipeline.definitions --select responses --partition"
 COMMANDS = (
