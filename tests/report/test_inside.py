@@ -30,8 +30,8 @@ from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
 from traps_pipeline.report.result_frames import Makers, Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
-from traps_pipeline.report.tables.control_reports import patching as patching_table
 from traps_pipeline.report.tables.inside_columns import why
+from traps_pipeline.report.tables.patching_tables import patching as patching_table
 from traps_pipeline.report.tables.steering_tables import steering as steering_tables
 from traps_pipeline.report.writing import PrintedTable
 from traps_pipeline.storage.study import Layers, MechanismSettings, Study

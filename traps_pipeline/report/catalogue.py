@@ -29,6 +29,7 @@ from traps_pipeline.report.tables import (
     hypothesis_tables,
     judge_tables,
     leaderboards,
+    patching_tables,
     setup_tables,
     sub_scenarios,
 )
@@ -181,7 +182,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("probe_baselines", control_reports.probe_baselines, ("probes", "probe_baselines"),
         title="Probes and their baselines"),
     TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
-    TableReport("patching", control_reports.patching, ("patching",)),
+    TableReport("patching", patching_tables.patching, ("patching",)),
     TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_tables.cosines,
         title="Void directions"),
     TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"),
