@@ -6,7 +6,6 @@ import argparse
 import os
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.keys import optional_key
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, number, open_workspace, whole
 
 CLUSTER = "of a study on a cluster"
@@ -31,6 +30,7 @@ def add(commands: Commands) -> None:
 def ui(arguments: argparse.Namespace) -> int:
     """See `traps ui --help`."""
     require("ui")
+    from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.process_tree import split
     from traps_pipeline.base.webguard import token_for
     from traps_pipeline.pipeline.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster

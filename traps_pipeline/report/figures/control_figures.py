@@ -12,8 +12,9 @@ from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to, legend_key
 from traps_pipeline.report.result_frames import Results, datasets_of
-from traps_pipeline.report.tables.control_reports import SITES, beside
+from traps_pipeline.report.tables.control_reports import beside
 from traps_pipeline.report.tables.inside_columns import SHORTCUTS, few, why
+from traps_pipeline.report.tables.patching_tables import SITES
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
     COLOURS,
