@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.judging.judged_answers import is_correct, normalise
+from traps_pipeline.models.judged_answers import is_correct, normalise
 
 SIDES = ["left", "right", "elsewhere"]
 ALIASES = {

@@ -7,9 +7,9 @@ import json
 
 import pytest
 
-from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.panel import Vote, parse_vote, render
 from traps_pipeline.judging.rules import ABSTENTION, RuleJudge, Statement, read_statement
+from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.models.judges import Task
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Request

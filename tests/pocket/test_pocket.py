@@ -20,8 +20,8 @@ from tools.pocket.words import PROMPTS, say
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.judging.judged_answers import normalise
 from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
+from traps_pipeline.models.judged_answers import normalise
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.storage.media import sample
 

@@ -15,8 +15,8 @@ from tools.pocket.data import SceneRecord, read_shards
 from tools.pocket.recipe import Recipe
 from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.judged_answers import is_correct
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
+from traps_pipeline.models.judged_answers import is_correct
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.protocol.regimes import PAPER_REGIMES

@@ -17,10 +17,10 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import NETWORK, ModelEntry, get_model

@@ -28,12 +28,12 @@ from pydantic import (
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.judging.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
 from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
 from traps_pipeline.models.judges import (
     Judge,
     JudgeEntry,

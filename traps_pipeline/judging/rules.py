@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.judging.judged_answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object
+from traps_pipeline.models.judged_answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.models.thinking import strip_fence
 

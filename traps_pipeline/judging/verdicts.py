@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.judged_answers import UNREAD
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.models.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.protocol.cells import Cell

@@ -12,7 +12,6 @@ from typing import Any
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.posteriors import posteriors
 from traps_pipeline.models.answer_rows import ResponseRow
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.framing import framed
@@ -26,6 +25,7 @@ from traps_pipeline.protocol.datasets import GRADED, dataset_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import StageOutput
+from traps_pipeline.storage.posteriors import posteriors
 from traps_pipeline.storage.workspace import Workspace
 
 # The columns of an item that a request, a response or a vote is made from.

@@ -18,12 +18,12 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.benchmark.items import item_hash
-from traps_pipeline.judging.judged_answers import is_correct
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.judged_answers import is_correct
 from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_seats
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import degenerate

@@ -187,10 +187,10 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return what every model and regime earns on graded cuts, against the true distribution over answers; empty if
     none was asked."""
-    from traps_pipeline.benchmark.posteriors import posteriors
     from traps_pipeline.models.answer_rows import RESPONSES
     from traps_pipeline.scoring.graded import Asked
     from traps_pipeline.scoring.graded import graded as against_posterior
+    from traps_pipeline.storage.posteriors import posteriors
 
     known = posteriors(workspace)
     asked = {

@@ -31,7 +31,7 @@ _CODE = Path(__file__).parents[2]
 _COPIED = (
     *("base/digests.py", "base/redaction.py", "protocol/regimes.py"),
     *("models/request.py", "models/endings.py", "models/thinking.py", "models/reading.py"),
-    *("judging/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
+    *("models/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
     *("release/harness/harness_items.py", "release/harness/inspect_task.py"),
 )
 _IMPORT = re.compile(r"(?m)^( *)from traps_pipeline\.([\w.]+) import ")
