@@ -8,6 +8,7 @@ from typing import Any, cast
 import pandas as pd
 
 from traps_pipeline.report.figures.graded_figure import graded
+from traps_pipeline.report.writing import freeze_layout
 
 TOPS = (0.5, 0.7, 0.9)
 
@@ -31,6 +32,8 @@ def test_decisions_stand_left_probabilities_right_and_a_model_has_one_entry() ->
     left, right = ([line for line in axes.lines if len(line.get_xdata()) == len(TOPS)] for axes in figure.axes)
     assert [set(line.get_ydata()) for line in left] == [{0.0}, {0.75}]
     assert [set(line.get_ydata()) for line in right] == [{0.6}, {0.4}]
+    freeze_layout(figure)
+    assert all(axes.get_position().width > 0.4 for axes in figure.axes)
     entries = [text.get_text() for text in figure.legends[0].get_texts()]
     assert entries == [
         "ideal observer", "oracle", "prior", "regime priced", "regime probabilities", "regime logprobs"

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LINES = ("-", "--", ":", "-.")
+_FROM = 0.2  # the likeliest of six answers is hardly less probable
 _APART = 0.008  # of the axis of probabilities, between the points of two models: several abstain and state alike
 
 
@@ -36,20 +37,22 @@ def graded(results: Results) -> Figure:
         figure = new_figure(PAGE_IN, 2.6 + 0.03 * (len(models) + len(regimes)))
         left, right = figure.subplots(1, 2)
         ideal: dict[str, Any] = {"color": SOFT, "linewidth": 2.5, "alpha": 0.45, "zorder": 0.5}
-        legend = left.plot([0.3, ANSWER_FROM, ANSWER_FROM, 1], [1, 1, 0, 0], label="ideal observer", **ideal)
-        right.plot([0.3, 1], [0.3, 1], **ideal)
+        legend = left.plot([_FROM, ANSWER_FROM, ANSWER_FROM, 1], [1, 1, 0, 0], label="ideal observer", **ideal)
+        right.plot([_FROM, 1], [_FROM, 1], **ideal)
         for k, model in enumerate(models):
             look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
             look |= {"markersize": 4, "clip_on": False}
             legend.append(Line2D([], [], label=plain(str(model)), **look))
             for regime in regimes:
                 part = rows.loc[rows["model"].eq(model) & rows["regime"].eq(regime)]
+                if not len(part):  # the layout makes room for an unclipped line of nothing
+                    continue
                 axes, share = (right, part["stated"]) if regime in states else (left, 1 - part["coverage"])
                 axes.plot(part["top"] + _APART * (k - len(models) / 2), share, linestyle=lines[regime], **look)
         legend += [Line2D([], [], color=SOFT, linestyle=lines[one], label=f"regime {one}") for one in regimes]
         left.set(ylim=(-0.03, 1.03), ylabel="share of abstentions")
         right.set(ylim=(-0.03, 1.03), ylabel="mean probability given to it")
         for axes in (left, right):
-            axes.set(xlim=(0.3, 1.03), xlabel="probability of the likeliest answer")
+            axes.set(xlim=(_FROM - 0.03, 1.03), xlabel="probability of the likeliest answer")
         figure.legend(handles=legend, loc="outside lower center", ncols=5, fontsize=6)
     return figure
