@@ -92,7 +92,8 @@ class Lineage:
         return ""
 
     def waits(self, name: str, key: str | None) -> bool:
-        """Return whether something above is outdated or must be made first, but for paid things that are not needed."""
+        """Return whether something above is outdated, is gone since this was made, or must be made first, but for paid
+        things that are not needed."""
         of_stage = self.graph[name].parents
         parents = {
             parent: keys
@@ -101,7 +102,15 @@ class Lineage:
             and not (of_stage[parent].need == "none" and self.graph[parent].cost == "money")
         }
         above = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
-        return any(self.status(*node).outdated for node in above) or bool(self.blocked(name, key, current=True))
+        state = self.state(name, key)
+        gone = (
+            node for node in above if state and name_of(node) in state.inputs and self.status(*node).kind == "missing"
+        )
+        return (
+            any(self.status(*node).outdated for node in above)
+            or any(gone)  # without it, figures would be made anew from less than before
+            or bool(self.blocked(name, key, current=True))
+        )
 
     def _unusable(self, name: str, key: str | None, current: bool) -> str:
         if damage := self.damage(name, key):
