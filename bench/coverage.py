@@ -10,6 +10,7 @@ the lowest coverage and the mean width over the strengths and kinds of dependenc
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -282,8 +283,12 @@ def main() -> None:
     arguments = parse(parser, sizes=4, parts=1)
     settings = [Setting(*one) for one in product([*SIZES][: arguments.sizes], STRENGTHS, DEPENDENCE)]
     run = partial(mean_of_parts, parts=arguments.parts, seed=arguments.seed)
+    tables = list[pd.DataFrame]()
     with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
-        table = pd.concat(pool.map(run, settings, chunksize=6), ignore_index=True)
+        for setting, rows in zip(settings, pool.map(run, settings), strict=True):
+            tables.append(rows)
+            print(f"{len(tables)} of {len(settings)}: {', '.join(vars(setting).values())}", file=sys.stderr)
+    table = pd.concat(tables, ignore_index=True)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
     print(summary(table), by_strength(table), sep="\n\n")
