@@ -3,8 +3,8 @@
 Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
 items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
 leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
-`--quick` takes half a minute of CPU; the full run six. `--csv FILE` keeps every setting; the printed tables have
-the lowest coverage and the mean width over the strengths and kinds of dependence of a size.
+`--quick` takes half a minute of CPU; the full run thirteen. `--csv FILE` keeps every setting; the printed tables have
+the lowest coverage and the mean width over the strengths and kinds of dependence of a size, and PECS by strength.
 """
 
 from __future__ import annotations
