@@ -9,7 +9,7 @@ tables, failed calls.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -46,10 +46,16 @@ class Lineage:
         workspace.store.look()
         self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
         self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
+        self._there = cache(self._keys_there)
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
         """Return versions of everything that is there to make a partition from, by name."""
-        nodes = [(parent, k) for parent, keys in self.graph.parents(stage, key).items() for k in keys]
+        nodes = [
+            (parent, k)
+            for parent, keys in self.graph.parents(stage, key).items()
+            for k in keys
+            if (there := self._there(parent)) is None or k in there
+        ]
         versions = {name_of(node): self.version(*node) for node in nodes}
         return {name: version for name, version in versions.items() if version is not None}
 
@@ -123,6 +129,14 @@ class Lineage:
         blocking = {check.name for check in self.graph[name].checks if check.blocks}
         failed = [check for check in self._workspace.failed_checks(name, key) if check in blocking]
         return f"does not pass its check {failed[0]}" if failed else ""
+
+    def _keys_there(self, name: str) -> Set[str] | None:
+        """Return the keys of a table's files, since a study has few of all that there could be; None for what has no
+        partitions in a table."""
+        if self.graph.source(name) is not None or (stage := self.graph[name]).table is None or stage.scheme is None:
+            return None
+        files = (tuple(partition.values()) for partition in self._workspace.tables.partitions(stage.table))
+        return {key for values in files if (key := stage.scheme.key_of.get(values)) is not None}
 
     def _state(self, name: str, key: str | None) -> State | None:
         stage = self.graph[name]
