@@ -44,7 +44,7 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
     parts: list[pd.DataFrame] = []
     for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *BESIDE))]:
         if value in rows:
-            wide = rows.pivot_table(index=keys, columns="side", values=value, dropna=False, observed=True)
+            wide = rows.groupby([*keys, "side"], observed=True, dropna=False)[value].mean().unstack("side")
             parts.append(wide.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
             columns += [f"control{suffix}", f"void{suffix}"]
     wide = parts[0].join(parts[1:]).reset_index().reindex(columns=pd.Index(columns))
