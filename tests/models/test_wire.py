@@ -31,11 +31,11 @@ from traps_pipeline.storage.study import Study
 
 PROXIES = ("http_proxy", "https_proxy", "all_proxy", "no_proxy")
 MODEL = "m"
-LONG_S = 300.0  # the first call of a process imports litellm within its time
+LONG_S = 300.0
 
 
 @pytest.fixture(autouse=True)
-def environment(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+def environment(client_library: None, monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """A key and no word about proxies and certificates."""
     for name in (*PROXIES, *(name.upper() for name in PROXIES), "SSL_CERT_FILE", "SSL_CERT_DIR"):
         monkeypatch.delenv(name, raising=False)
