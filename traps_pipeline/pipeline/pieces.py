@@ -91,7 +91,8 @@ class _Shared:
     def keep(self) -> None:
         """Store what was made."""
         if self._pieces and self._is_new:
-            inputs, contents = ({name: each[k] for name, each in self._pieces.items()} for k in (0, 1))
+            inputs = {name: of for name, (of, _) in self._pieces.items()}
+            contents = {name: content for name, (_, content) in self._pieces.items()}
             with suppress(OSError, RuntimeError):
                 write_bytes(self._path, _archive(inputs, contents))
 
