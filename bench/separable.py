@@ -5,7 +5,8 @@ when, how much moves and when it rests), a regression reads the words of a quest
 so that no picture is drawn: a reader of pixels knows them less well. Where a rule does not abstain it answers like an
 oracle, so that each figure bounds what it can earn. `or` and `and` join the two decisions, `sum` adds their evidence;
 `joint` is no such rule: one classifier that reads both. Each is fitted on other scenarios, or on other families, than
-it is asked about. The figures are the project's own (`scoring`).
+it is asked about. The first four are the cues of `models.shortcut_rules`, one line each, with nothing to fit. All
+figures are the project's own (`scoring`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from bench.shortcuts import first_of_each
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.models.shortcut_rules import CUT_FRAMES, names_no_choices
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN
 from traps_pipeline.scenes.picture.camera import Camera, Panel
 from traps_pipeline.scenes.variants.arms import SHOWN_AGAIN_S
@@ -40,6 +42,7 @@ BEHIND_M = 1.0  # a decoy's distance behind the board's place, about what arms c
 FOLDS = {"scenario_id": 5, "family": 12}
 WORDS = 300  # the commonest words and pairs of words
 RULES = ("clip", "text", "or", "and", "sum", "joint")
+Decisions = dict[str, np.ndarray]
 
 
 def main() -> None:
@@ -50,8 +53,8 @@ def main() -> None:
     items = pd.DataFrame([row for spec in chosen for row in rows_of(spec)])
     print(f"{len(items)} items of {len(chosen)} scenarios, {items['family'].nunique()} families")
     for held_out, folds in FOLDS.items():
-        print(f"\n{held_out} held out: PECS, robust, conjunction; J of the four datasets and of crossed")
-        for rule, abstains in decisions(items, held_out, folds).items():
+        print(f"\n{held_out} held out: PECS, robust, conjunction; J of {', '.join((*DATASETS, CROSSED))}")
+        for rule, abstains in (one_line(items) | decisions(items, held_out, folds)).items():
             print_figures(rule, items.assign(abstained=abstains))
 
 
@@ -136,7 +139,17 @@ def asked_of(spec: SceneSpec) -> Iterator[tuple[str, str, str, Clip]]:
 # --- rules ------------------------------------------------------------------------------------------------------------
 
 
-def decisions(items: pd.DataFrame, held_out: str, folds: int) -> dict[str, np.ndarray]:
+def one_line(items: pd.DataFrame) -> Decisions:
+    """Return whether each cue alone, and any of them, makes a rule abstain on each item."""
+    cues = {
+        "panel": items["f1"].to_numpy(float) > 0,  # one stands in the first frame
+        "length": items["f0"].to_numpy(float) < CUT_FRAMES,
+        "wording": items["question"].map(names_no_choices).to_numpy(bool),
+    }
+    return cues | {"any": np.logical_or.reduce([*cues.values()])}
+
+
+def decisions(items: pd.DataFrame, held_out: str, folds: int) -> Decisions:
     """Return whether each rule abstains on each item, fitted on items of other groups (`held_out`)."""
     void, crossed = (items["side"] == "void").to_numpy(), (items["dataset"] == CROSSED).to_numpy()
     ill_posed = void & items["dataset"].str.endswith("_ill_posed").to_numpy()
@@ -193,7 +206,7 @@ def print_figures(rule: str, items: pd.DataFrame) -> None:
     control, j = shares["control"], shares["void"] - shares["control"]
     pecs = pecs_of((1 - control).to_numpy(float), j.to_numpy(float))[j.index.isin(DATASETS)].mean()
     figures = " ".join(f"{value:6.3f}" for value in (pecs, row["robust"], row["conjunction"]))
-    print(f"  {rule:6} {figures}  ", *(f"{j[dataset]:5.2f}" for dataset in (*DATASETS, CROSSED)))
+    print(f"  {rule:7} {figures}  ", *(f"{j[dataset]:5.2f}" for dataset in (*DATASETS, CROSSED)))
 
 
 if __name__ == "__main__":

@@ -100,6 +100,7 @@ def test_the_verbatim_prompts_carry_the_licence_of_the_papers_release() -> None:
         "judge_confabulation.txt",
         "judge_premise_suffix.txt",
         "priced_suffix.txt",
+        "logprobs_suffix.txt",
         *adapted,
     ]
     for name in ("assets/prompts/README.md", "LICENSE-DATA", "README.md", "docs/limits.md"):

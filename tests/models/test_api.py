@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import json
 import os
 import subprocess
 import sys
 from ast import literal_eval
 from importlib.metadata import version
+from math import log
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +43,12 @@ def backend(provider: Provider, route: str, limits: Limits | None = None, **para
     return ApiBackend(Entry.model_validate(fields, context={"accounts": {"a": account}}), account)
 
 
-def ask(provider: Provider, route: str, **params: Any) -> Outcome:
+def ask(provider: Provider, route: str, regime: str = "standard", **params: Any) -> Outcome:
     asking = backend(provider, route, **params)
     sent = asking._entry.params  # the request of a real run holds the same
-    return asyncio.run(asking.ask(Request("m", route, sent, "You watch a clip.", QUESTION, {"item_id": "x"})))
+    return asyncio.run(
+        asking.ask(Request("m", route, sent, "You watch a clip.", QUESTION, {"item_id": "x", "regime": regime}))
+    )
 
 
 @pytest.mark.promise
@@ -66,6 +70,15 @@ def test_an_answer_is_read_with_what_it_took(provider: Provider, route: str) -> 
     assert outcome.cost_usd == pytest.approx((outcome.prompt_tokens + 10 * outcome.completion_tokens) / 1e6)
     (record,) = provider.requests()
     assert SECRET not in str(record)
+
+
+def test_log_probabilities_of_the_first_word_are_kept_where_they_are_scored(provider: Provider) -> None:
+    asked, route = {"logprobs": True, "top_logprobs": 2}, "openai/m"
+    kept = ask(provider, route, regime="logprobs", **asked)
+    assert kept.text == f"The answer is: {answer_to(QUESTION)}."
+    assert json.loads(str(kept.first_token)) == pytest.approx({"The": log(0.75), "No": log(0.25)}, abs=1e-6)
+    assert ask(provider, route, regime="logprobs").first_token is None  # they were not asked for
+    assert ask(provider, route, regime="standard", **asked).first_token is None
 
 
 IN_A_LOOP = """

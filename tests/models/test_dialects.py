@@ -72,6 +72,31 @@ def test_a_finish_reason_is_kept_as_it_came_and_has_its_documented_meaning(
     assert [*reply.usage.values()] == [9]
 
 
+def test_the_first_token_that_holds_a_letter_is_the_answers() -> None:
+    def token(text: str, logprob: float, *others: Any) -> dict[str, Any]:
+        return {"token": text, "logprob": logprob, "top_logprobs": list(others)}
+
+    content = [token("**", -0.1), token("left", -0.2, token("left", -0.2), token(" right", -1.7)), token("No", 0.0)]
+    body = chat()
+    body["choices"][0]["logprobs"] = {"content": content}
+    assert read("chat", body).first_token == {"left": -0.2, " right": -1.7}
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        None, [], {"content": None}, {"content": ["left"]}, {"content": [{"token": "left"}]},
+        {"content": [{"token": "left", "logprob": True}]}, {"content": [{"token": "left", "logprob": 0.5}]},
+        {"content": [{"token": 3, "logprob": -1.0}]}, {"content": [{"token": "left", "logprob": "-1"}]},
+    ],
+)  # fmt: skip
+def test_odd_log_probabilities_are_none_and_the_answer_stays(odd: Any) -> None:
+    body = chat()
+    body["choices"][0]["logprobs"] = odd
+    reply = read("chat", body)
+    assert (reply.text, reply.first_token) == (LEFT, {})
+
+
 def test_an_incomplete_response_says_why() -> None:
     cut_off = read("responses", responses("incomplete", "max_output_tokens"))
     assert (cut_off.finish, cut_off.ending, cut_off.reasoning) == ("max_output_tokens", "truncated", "I look.")

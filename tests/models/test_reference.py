@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from dataclasses import replace
+from math import exp
 from typing import Any
 
 import pytest
@@ -50,6 +51,16 @@ def test_an_abstention_rate_holds_on_both_sides_within_three_sigma(model: str, r
     for side in ("control", "void"):
         count = sum(STRATEGIES["abstain-at-rate"](request(side, k, **params)) is None for k in range(n))
         assert abs(count - n * rate) <= 3 * (n * rate * (1 - rate)) ** 0.5  # 67 of 1,000; 54 of 400
+
+
+def test_a_strategy_gives_the_first_token_of_its_answer_the_probability_that_it_believes() -> None:
+    asked = request("control", regime="logprobs", **get_model("bayes").params)
+    asked = replace(asked, secret={**asked.secret, "posterior": {"left": 0.8, "elsewhere": 0.2}})
+    given = json.loads(str(asyncio.run(ReferenceBackend().ask(asked)).first_token))
+    assert {token: exp(logprob) for token, logprob in given.items()} == pytest.approx({"left": 0.8, "elsewhere": 0.2})
+    abstains = request("control", regime="logprobs", strategy="always-abstain")
+    assert json.loads(str(asyncio.run(ReferenceBackend().ask(abstains)).first_token)) == {ABSTENTION: 0.0}
+    assert asyncio.run(ReferenceBackend().ask(request("control", strategy="oracle"))).first_token is None
 
 
 def test_bayes_answers_what_is_probable_enough_and_states_what_it_believes() -> None:

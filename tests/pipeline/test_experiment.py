@@ -12,6 +12,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.protocol.datasets import DATASETS, datasets_of_category
+from traps_pipeline.protocol.regimes import PAPER_REGIMES, REGIMES
 from traps_pipeline.scoring.doses import DATASETS_READ, RULES
 from traps_pipeline.storage.study import Study
 
@@ -38,6 +39,12 @@ def test_the_experiments_of_hypotheses_ask_every_dose_and_what_it_is_compared_wi
         assert set(found.datasets) == set(DATASETS_READ)
         assert {*RULES} <= {*found.models}  # the trivial thing that would give a number too
         assert not {"occlusion_ill_posed", "chaotic_ill_posed"} & {*found.datasets}  # so it has no overall PECS
+
+
+def test_the_experiment_of_graded_cuts_asks_scenarios_that_have_one() -> None:
+    found, released = load_experiment("graded"), load_released()
+    assert found.datasets == ["graded"] and {*found.regimes} == {*REGIMES} - {*PAPER_REGIMES}
+    assert {released[scenario].taxonomy for scenario in found.study.scenarios or ()} == {"chaotic"}
 
 
 def test_the_study_of_an_experiment_is_its_benchmark_subset_panel_and_budget(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import base64
 import binascii
 import hashlib
 import json
+import math
 import os
 import random
 import re
@@ -165,6 +166,7 @@ class Question:
     prompt_tokens: int
     colours: tuple[str, ...] = ()  # of the clip, where it is asked for them
     most_tokens: int = 0  # that the completion may take
+    logprobs: int = 0  # alternatives of each token that are asked for
 
 
 def api_of(path: str) -> tuple[Api, str] | None:
@@ -200,6 +202,7 @@ def read_question(api: Api, model: str, body: Json, blind: Sequence[str] = ()) -
         prompt_tokens=sum(len(text) for _, text in texts) // 4 + 1 + media * _MEDIA_TOKENS,
         colours=_colours(clips) if asked and _ASKS_COLOURS in asked[-1] else (),
         most_tokens=int(body.get("max_tokens") or body.get("max_output_tokens") or 0),
+        logprobs=int(body["top_logprobs"]) if body.get("logprobs") is True else 0,
     )
 
 
@@ -378,6 +381,13 @@ def _usage(question: Question, ending: Ending) -> tuple[int, int]:
     return question.prompt_tokens, len(said) // 4 + bool(said)
 
 
+def _logprobs(question: Question, ending: Ending) -> list[Json]:
+    """Each word as a token, which something else might have been with a probability of a quarter."""
+    given, other = math.log(0.75), {"token": "No", "logprob": math.log(0.25)}
+    tokens = [{"token": word, "logprob": given} for word in ['"', *re.findall(r"\s*\S+", ending.text or "")]]
+    return [token | {"top_logprobs": [token, other][: question.logprobs]} for token in tokens]  # a quote comes first
+
+
 def _chat_body(question: Question, ending: Ending, served_model: str) -> Json:
     prompt, visible = _usage(question, ending)
     content = None if ending.refusal else ending.text or ""
@@ -385,7 +395,7 @@ def _chat_body(question: Question, ending: Ending, served_model: str) -> Json:
     choice = {
         "index": 0,
         "message": message | {"reasoning_content": _reasoning(question)},
-        "logprobs": None,
+        "logprobs": {"content": _logprobs(question, ending)} if question.logprobs else None,
         "finish_reason": ending.finish,
     }
     return {

@@ -290,6 +290,11 @@ def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
     assert (reads & below) - not_the_panels == JUDGED_STAGES
 
 
+def test_a_caption_says_what_is_shown_and_not_what_a_function_does():
+    captions = [report.doc for report in (*TABLE_REPORTS, *FIGURE_REPORTS)]
+    assert [text for text in captions if not text or text.startswith(("Return", "Yield")) or text[0].islower()] == []
+
+
 def test_the_page_of_the_docs_names_every_table_and_figure():
     rows = re.findall(r"^\| (.+?) \|(.*)\|$", (ROOT / "docs" / "report.md").read_text(), re.MULTILINE)
     for column, reports in enumerate((TABLE_REPORTS, FIGURE_REPORTS)):

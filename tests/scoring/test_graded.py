@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -84,7 +85,30 @@ def test_stated_probabilities_are_read_or_refused(entries: list[Any], expected: 
     assert SURE.read_probabilities('{"probabilities": {"left": 0.9}}') is None
 
 
-def answers(model: str, sure: Said, open_: Said, regime: str = "priced", texts: Mapping[str, str] = {}) -> Any:
+@pytest.mark.parametrize(
+    ("tokens", "expected"),
+    [
+        ({"left": 0.7, " right": 0.2, "else": 0.1}, (0.7, 0.2, 0.1)),
+        ({"Red": 0.6, "**r": 0.2, "the": 0.1}, (0.6 + 0.4 / 3, 0.4 / 3, 0.4 / 3)),  # red bin or right; no answer
+        ({"I": 0.9, "left": 0.1}, (0.1 + 0.3, 0.3, 0.3)),  # what begins an abstention is shared evenly
+        ({'"': 1.0}, (1 / 3, 1 / 3, 1 / 3)),
+        ({"left": 0.8, "LEFT": 0.3}, (1, 0, 0)),  # rounded up
+    ],
+)
+def test_a_first_token_counts_for_the_answer_that_it_begins(tokens: dict[str, float], expected: Any) -> None:
+    read = SURE.read_first_token(json.dumps({token: math.log(p) for token, p in tokens.items()}))
+    assert list((read or {}).values()) == pytest.approx(list(expected))
+    assert SURE.read_first_token(None) is None
+
+
+def answers(
+    model: str,
+    sure: Said,
+    open_: Said,
+    regime: str = "priced",
+    texts: Mapping[str, str] = {},
+    tokens: Mapping[str, str] = {},
+) -> Any:
     """VERDICTS, VOTES and RESPONSES rows of a model's answers to both cuts, each judged by three."""
     parts: tuple[list[Any], list[Any], list[Any]] = ([], [], [])
     for id_, said in zip(ASKED, (sure, open_), strict=True):
@@ -93,7 +117,7 @@ def answers(model: str, sure: Said, open_: Said, regime: str = "priced", texts: 
         for judge, value in enumerate(said if isinstance(said, tuple) else (said, said, "elsewhere")):
             vote = {"task": "correctness", "judge": f"rule-{judge}", "valid": True, "extracted_value": value}
             parts[1].append(row(VOTES, **vote, **its))
-        parts[2].append(row(RESPONSES, outcome="answer", text=texts.get(id_), **its))
+        parts[2].append(row(RESPONSES, outcome="answer", text=texts.get(id_), first_token=tokens.get(id_), **its))
     return parts
 
 
@@ -151,6 +175,18 @@ def test_stated_probabilities_are_acted_on_at_the_price_and_an_undecided_answer_
     assert (careful["points"], careful["coverage"]) == (pytest.approx(0.3), 0.5)
     assert careful["stated"] == pytest.approx(0.745)
     assert of.loc[["sloppy", "split"], ["n_items", "n_missing"]].to_numpy().tolist() == [[1, 1], [1, 1]]
+
+
+def test_log_probabilities_are_scored_as_stated_probabilities_are() -> None:
+    tokens = ({"left": 0.75, "right": 0.25}, {"left": 0.5, "I": 0.5})
+    stored = [json.dumps({token: math.log(p) for token, p in its.items()}) for its in tokens]
+    parts = answers("model", "left", "left", "logprobs", tokens=dict(zip(ASKED, stored, strict=True)))
+    silent = answers("silent", "left", None, "logprobs")  # its provider gives none
+    (own,) = table(parts, silent).query("scope == 'all'").to_dict("records")
+    # (.75, .25, 0) where (.9, .1, 0) is true, and (4/6, 1/6, 1/6) where (.5, .3, .2) is.
+    off = (2 * 0.15**2, (4 / 6 - 0.5) ** 2 + (0.3 - 1 / 6) ** 2 + (0.2 - 1 / 6) ** 2)
+    assert own["brier"] == pytest.approx((off[0] + 0.18 + off[1] + 0.62) / 2)
+    assert (own["model"], own["points"], own["coverage"]) == ("model", pytest.approx(0.3), 0.5)
 
 
 def test_without_graded_cuts_there_is_no_row() -> None:

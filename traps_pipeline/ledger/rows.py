@@ -49,7 +49,7 @@ def is_count(value: Any) -> bool:
 
 # What a provider says; anything else is unknown.
 _SAID: dict[str, Callable[[Any], bool]] = {
-    **dict.fromkeys(("text", "finish_reason", "error", "served_model", "client"), _is_text),
+    **dict.fromkeys(("text", "finish_reason", "error", "served_model", "client", "first_token"), _is_text),
     **dict.fromkeys(("prompt_tokens", "completion_tokens", "reasoning_tokens"), is_count),
     "cost_usd": is_cost,
 }

@@ -18,6 +18,7 @@ class ResponseRow(shared.CellRow):
     text: Annotated[str | None, "the visible answer; null unless outcome is answer"]
     reasoning: Annotated[str | None, "the trace, where the provider returns it"]
     is_json: Annotated[bool | None, "JSON regime: whether the text is the object that the prompt asks for"]
+    first_token: Annotated[str | None, "regime logprobs: JSON object, token to log-probability, likeliest first"]
     finish_reason: Annotated[str | None, "as the provider sent it"]
     error: Annotated[str | None, "kind of a failure, or why a text is no answer; never shown to a judge"]
     served_model: Annotated[str | None, "what the provider says answered"]

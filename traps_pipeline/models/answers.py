@@ -150,6 +150,7 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
         text=read.text,
         reasoning=read.reasoning,
         is_json=read.is_json,
+        first_token=row.get("first_token"),
         error=read.why or row["error"],
         request_key=row["key"],
     )

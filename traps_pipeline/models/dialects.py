@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.models import first_token
 from traps_pipeline.models.endings import Ending, ending_of
 
 Dialect = Literal["chat", "responses", "anthropic", "gemini"]
@@ -42,7 +43,8 @@ class OddShapeError(ValueError):
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer as its provider sent it. finish: the raw finish reason; usage: the raw counts."""
+    """An answer as its provider sent it. finish: the raw finish reason; usage: the raw counts; first_token:
+    log-probabilities of what may have been its first token, where it says any."""
 
     text: str
     reasoning: str
@@ -51,6 +53,7 @@ class Reply:
     ending: Ending
     served_model: str | None
     usage: Json
+    first_token: Mapping[str, float] = field(default_factory=dict)
 
 
 def dialect_of(provider_id: str) -> Dialect:
@@ -146,7 +149,8 @@ def _chat(body: Json) -> Reply:
     texts.add(_text_of(message, "refusal"), "refusal")
     if not texts.reasoning:
         texts.add(_text_of(message, "reasoning_content") or _text_of(message, "reasoning"), "reasoning")
-    return texts.reply(choice.get("finish_reason"), body.get("model"), body.get("usage"))
+    reply = texts.reply(choice.get("finish_reason"), body.get("model"), body.get("usage"))
+    return replace(reply, first_token=first_token.of_chat(choice.get("logprobs")))
 
 
 def _responses(body: Json) -> Reply:

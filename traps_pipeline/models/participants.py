@@ -245,6 +245,8 @@ def ledger_row(
     order."""
     fields = asdict(outcome)
     beside = {name: text for name in ASIDES if (text := fields.pop(name)) is not None}
+    if fields["first_token"] is None:
+        del fields["first_token"]  # few calls have it, and each row is stored
     row = {
         "key": request.key,
         "outcome": fields.pop("kind"),

@@ -10,11 +10,12 @@ import asyncio
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
-from math import exp
+from math import exp, log
 from statistics import NormalDist
 from typing import Any
 
 from traps_pipeline.base.digests import digest
+from traps_pipeline.models.first_token import stored
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.protocol.regimes import fields_of
@@ -95,8 +96,14 @@ def phrase(answer: str | None, request: Request) -> str:
 def _stated(answer: str | None, request: Request) -> dict[str, Any]:
     """Return the probabilities that go with an answer: those of `bayes`; else all for the answer, and of an abstention
     none, which leaves all answers alike."""
-    belief = believed(request) if request.params.get("strategy") == "bayes" else {answer: 1.0} if answer else {}
+    belief = _belief(answer, request)
     return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in belief.items()]}
+
+
+def _belief(answer: str | None, request: Request) -> dict[str, float]:
+    if request.params.get("strategy") == "bayes":
+        return believed(request)
+    return {answer: 1.0} if answer else {}
 
 
 class ReferenceBackend:
@@ -111,8 +118,16 @@ class ReferenceBackend:
         misfortune = self._misfortune(request)
         if misfortune is not None:
             return misfortune
-        text = phrase(STRATEGIES[request.params["strategy"]](request), request)
-        return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
+        answer = STRATEGIES[request.params["strategy"]](request)
+        belief = {label: log(p) for label, p in _belief(answer, request).items() if p} or {ABSTENTION: 0.0}
+        return Outcome(
+            "answer",
+            phrase(answer, request),
+            finish_reason="stop",
+            served_model=request.participant,
+            cost_usd=0.0,
+            first_token=stored(belief, request.about.get("regime")),
+        )
 
     def _misfortune(self, request: Request) -> Outcome | None:
         """Return what the `faults` shares (empty, refused, failing, transient) make of this request; None for an

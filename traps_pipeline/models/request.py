@@ -70,7 +70,8 @@ class Outcome:
     """What came of a request. A failure is a kind, never a text: no error string ever reaches a judge.
 
     finish_reason: as the provider sent it. client: library and version that built the call and sent it. raw: the
-    beginning of an answer that is out of order, for a person. cost_usd: None if it is unknown.
+    beginning of an answer that is out of order, for a person. cost_usd: None if it is unknown. first_token: see
+    `first_token.stored`.
     """
 
     kind: OutcomeKind
@@ -85,10 +86,11 @@ class Outcome:
     reasoning_tokens: int | None = None
     cost_usd: float | None = None
     raw: str | None = None
+    first_token: str | None = None
 
     def __post_init__(self) -> None:
         """Remove keys from what a provider said: it may echo the request's headers."""
-        for name in ("text", "reasoning", "finish_reason", "error", "served_model", "raw"):
+        for name in ("text", "reasoning", "finish_reason", "error", "served_model", "raw", "first_token"):
             value = getattr(self, name)
             if value:
                 object.__setattr__(self, name, redact(value))

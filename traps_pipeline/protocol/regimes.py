@@ -13,6 +13,7 @@ class Regime:
 
     fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
     read (docs/spec.md 7.1); none: no states are read under this regime. marker: of a model's point in the landscape.
+    first_token: whether the log-probabilities of the answer's first token are kept and scored.
     """
 
     name: str
@@ -20,6 +21,7 @@ class Regime:
     fields: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
     marker: Literal["hollow", "filled", "dot"] = "dot"
+    first_token: bool = False
 
 
 # To add a regime, add an entry here and its texts in `assets/prompts`; a name is of lower-case letters.
@@ -35,6 +37,7 @@ BY_NAME: Mapping[str, Regime] = {
             ("standard", "probabilities_suffix"),
             fields=("reason", "probabilities", "final_answer"),
         ),
+        Regime("logprobs", ("vqa_standard", "logprobs_suffix"), first_token=True),
     )
 }
 # The fields of the object that an answer must be, by what asks for it; any other answer is free text.

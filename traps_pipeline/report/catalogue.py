@@ -255,4 +255,6 @@ def _is_judged(reads: Sequence[str]) -> bool:
 
 
 def _first_paragraph(make: Callable[..., object]) -> str:
-    return " ".join((make.__doc__ or "").split("\n\n")[0].split())
+    """Return the first paragraph of a docstring as a caption, without the verb that says what a function does."""
+    text = " ".join((make.__doc__ or "").split("\n\n")[0].split()).removeprefix("Return ")
+    return text[:1].upper() + text[1:]

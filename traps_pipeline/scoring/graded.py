@@ -6,16 +6,18 @@ earn follows from the posterior of its cut, so no figure here depends on which o
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import exp
 from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.models.judged_answers import is_correct, read_object, to_label
-from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS, fields_of
+from traps_pipeline.protocol.regimes import ANSWER_FROM, BY_NAME, WRONG_COSTS, fields_of
 from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Drawn, draw_scenarios, ends_of_mean, with_interval
 from traps_pipeline.scoring.metrics import joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import GRADED_CUTS
@@ -68,6 +70,25 @@ class Asked:
         stated |= dict.fromkeys(others, max(0.0, left) / max(1, len(others)))
         return {label: stated[label] / sum(stated.values()) for label in self.labels}
 
+    def read_first_token(self, alternatives: object) -> dict[str, float] | None:
+        """Return the probability of each answer by the tokens that may begin it; None without log-probabilities. A
+        token counts for the answer that it names, else for the only one with a name that it begins; what counts for
+        none is shared evenly."""
+        if not isinstance(alternatives, str):
+            return None
+        names = {name.casefold(): label for name, label in self.aliases.items()}
+        names |= {label.casefold(): label for label in self.labels}
+        known = dict.fromkeys(self.labels, 0.0)
+        for token, logprob in json.loads(alternatives).items():
+            start = token.strip().strip("\"'*`.,:").casefold()
+            begun = {label for name, label in names.items() if start and name.startswith(start)}
+            begun = {names[start]} if start in names else begun
+            if len(begun) == 1:
+                known[begun.pop()] += exp(logprob)
+        total = sum(known.values())
+        rest = max(0.0, 1 - total) / len(known)
+        return {label: (p + rest) / max(1.0, total) for label, p in known.items()}
+
 
 def graded(
     verdicts: pd.DataFrame,
@@ -78,12 +99,15 @@ def graded(
     seed: int = SEED,
 ) -> pd.DataFrame:
     """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, which are given by id."""
-    labels, texts = _labels(votes, asked), responses.set_index(_ANSWER)["text"].to_dict()
+    labels, by_answer = _labels(votes, asked), responses.set_index(_ANSWER)
+    texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
     rows = []
     for verdict in verdicts.to_dict("records"):
         key, item = tuple(verdict[name] for name in _ANSWER), asked[verdict["item_id"]]
         if "probabilities" in (fields_of(verdict["regime"]) or ()):
             figures = _of_probabilities(item, item.read_probabilities(texts.get(key)))
+        elif BY_NAME[verdict["regime"]].first_token:
+            figures = _of_probabilities(item, item.read_first_token(first_tokens.get(key)))
         else:
             figures = _of_verdict(item, verdict["abstained"], labels.get(key))
         rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **figures})

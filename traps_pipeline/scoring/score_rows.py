@@ -283,8 +283,10 @@ class GradedRow:
     regret_shy: Annotated[float | None, "because of abstaining where an answer earns more"]
     abstains_right: Annotated[float | None, "share abstained on where abstaining earns more"]
     abstains_wrong: Annotated[float | None, "share abstained on where an answer earns more"]
-    stated: Annotated[float | None, "mean probability stated for the commonest answer; null where none is asked for"]
-    brier: Annotated[float | None, "expected Brier score of stated probabilities, from 0 to 2", CI]
+    stated: Annotated[
+        float | None, "mean probability given to the commonest answer; null where the regime asks for none"
+    ]
+    brier: Annotated[float | None, "expected Brier score of these probabilities, from 0 to 2", CI]
     brier_ideal: Annotated[float, "that of the posterior itself"]
     brier_even: Annotated[float, "that of equal probabilities"]
     points_ideal: Annotated[float, "what an ideal observer earns"]

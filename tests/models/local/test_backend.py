@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from math import exp
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, checkpoint, clip, entry, model
 from traps_pipeline.base.digests import file_digest
@@ -26,18 +30,18 @@ from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, wo
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.storage.media import MediaStore
+from traps_pipeline.storage.media import MediaStore, sample
 
 pytestmark = pytest.mark.slow
 
 SAMPLED = {"do_sample": True, "temperature": 0.8, "top_p": 0.95}
 
 
-def request(of: ModelEntry, media: MediaStore, question: str, run: int = 1) -> Request:
+def request(of: ModelEntry, media: MediaStore, question: str, run: int = 1, regime: str = "standard") -> Request:
     """What the responses stage would ask."""
     sent = media.prepare(clip(), file_digest(clip()), SIX_FRAMES)
-    about = {"item_id": question, "model": of.id, "regime": "standard", "run": run}
-    params = effective_params(of, "standard")
+    about = {"item_id": question, "model": of.id, "regime": regime, "run": run}
+    params = effective_params(of, regime)
     return Request(of.id, of.backend, params, SYSTEM, question, about, clip(), sent, sent.sha256)
 
 
@@ -84,6 +88,28 @@ def test_runs_differ_and_the_same_call_does_not(tmp_path: Path) -> None:
     one, again, two = (answers(of, [each])[0] for each in (first, first, second))
     assert one == again
     assert one.text != two.text
+
+
+def test_the_probabilities_of_the_first_token_are_those_of_its_logits_whatever_is_drawn(tmp_path: Path) -> None:
+    media, given = MediaStore(tmp_path), {}
+    for name, sampled in (("greedy", {}), ("sampled", SAMPLED)):
+        of = entry("qwen3-vl", **sampled)
+        asked = [request(of, media, QUESTIONS[0], regime=regime) for regime in ("logprobs", "standard")]
+        (kept, other), loaded = answers(of, asked), load_local_model(of)
+        assert other.first_token is None
+        given[name] = json.loads(str(kept.first_token))
+    seen = sample(clip(), SIX_FRAMES)
+    prompt = loaded.prompt(SYSTEM, QUESTIONS[0], seen.frames, seen.times_s)
+    with torch.inference_mode():
+        values, tokens = loaded.network(**loaded.placed(prompt.inputs)).logits[0, -1].softmax(-1).topk(20)
+    likeliest = Counter[str]()
+    for token, value in zip(tokens.tolist(), values.tolist(), strict=True):
+        likeliest[loaded.processor.tokenizer.decode([token])] += value
+    assert given["greedy"] == given["sampled"]
+    kept = {token: exp(logprob) for token, logprob in given["greedy"].items()}
+    off = sum(kept.values()) / sum(likeliest.values())  # tokens that are never generated have none of it
+    assert kept == pytest.approx({token: value * off for token, value in likeliest.items()}, rel=1e-4)
+    assert 1 <= off < 1.02
 
 
 def test_an_answer_cut_off_is_truncated_and_nothing_is_empty() -> None:

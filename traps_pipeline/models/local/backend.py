@@ -9,12 +9,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from threading import Event
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.models.first_token import stored
 from traps_pipeline.models.framing import framed
 from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
@@ -101,8 +102,13 @@ class LocalBackend:
         if self._params.temperature is not None and self._params.top_p is not None:
             sampling = Sampling(self._params.temperature, self._params.top_p, seeds(batch.requests))
         generated = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
-        return [outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model)
-                for one in generated]  # fmt: skip
+        return [
+            replace(
+                outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model),
+                first_token=stored(one.first_token, request.about.get("regime")),
+            )
+            for request, one in zip(batch.requests, generated, strict=True)
+        ]
 
 
 def _frames(request: Request, spec: MediaSpec) -> Frames:

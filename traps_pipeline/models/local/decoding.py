@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
+from traps_pipeline.models.first_token import MOST
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
@@ -49,21 +50,38 @@ def decode(
     steering: Steers | None,
     use_cache: bool,
     stopped: Callable[[], bool],
-) -> list[list[int]]:
-    """Return the tokens behind each prompt, those behind an answer's end included; greedy unless sampling is given."""
+) -> tuple[list[list[int]], list[dict[int, float]]]:
+    """Return the tokens behind each prompt, those behind an answer's end included, and the log-probabilities of its
+    first place; greedy unless sampling is given."""
     import torch
 
     transformers, pad = load_transformers(), model.network.generation_config.pad_token_id
     inputs: dict[str, Any] = model.placed(collate(prompts, pad))
+    first = _FirstToken()
+    processors = [first, SeededNucleus(sampling)] if sampling else [first]
     with torch.inference_mode(), steered(steering, model):
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,
             use_cache=use_cache,
-            logits_processor=transformers.LogitsProcessorList([SeededNucleus(sampling)] if sampling else []),
+            logits_processor=transformers.LogitsProcessorList(processors),
             stopping_criteria=transformers.StoppingCriteriaList([_Stopping(stopped)]),
         )
-    return sequences[:, inputs["input_ids"].shape[1] :].tolist()
+    return sequences[:, inputs["input_ids"].shape[1] :].tolist(), first.likeliest
+
+
+class _FirstToken:
+    """A logits processor of transformers that keeps the likeliest tokens of the first place, and changes nothing."""
+
+    def __init__(self) -> None:
+        self.likeliest: list[dict[int, float]] = []  # token to log-probability, a prompt
+
+    def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
+        if not self.likeliest:
+            values, tokens = scores.float().log_softmax(dim=-1).topk(min(MOST, scores.shape[-1]))
+            rows = zip(tokens.tolist(), values.tolist(), strict=True)
+            self.likeliest = [dict(zip(*row, strict=True)) for row in rows]
+        return scores
 
 
 class _Stopping:

@@ -32,13 +32,15 @@ MEMORY_SHARE = 0.7  # of what is free that a batch may take by estimate
 
 @dataclass(frozen=True)
 class Generated:
-    """An answer. finish_reason: stop, or length where `max_new_tokens` cut it off."""
+    """An answer. finish_reason: stop, or length where `max_new_tokens` cut it off. first_token: log-probabilities of
+    the likeliest tokens of its first place."""
 
     text: str
     prompt_tokens: int
     completion_tokens: int
     finish_reason: str
     tokens: tuple[int, ...]
+    first_token: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,17 +281,22 @@ class LocalModel:
         use_cache: bool,
         stopped: Callable[[], bool],
     ) -> list[Generated]:
-        rows = decode(self, prompts, max_new_tokens, sampling, steering, use_cache, stopped)
-        return [self._answer(prompt, row) for prompt, row in zip(prompts, rows, strict=True)]
+        rows, first = decode(self, prompts, max_new_tokens, sampling, steering, use_cache, stopped)
+        return [self._answer(*one) for one in zip(prompts, rows, first, strict=True)]
 
-    def _answer(self, prompt: Prompt, tokens: list[int]) -> Generated:
+    def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> Generated:
         eos = self.network.generation_config.eos_token_id
         ends = {eos} if isinstance(eos, int) else {*eos}
         ended = next((i for i, token in enumerate(tokens) if token in ends), None)
         kept = tokens if ended is None else tokens[: ended + 1]
         with self._processing:
             text = self.processor.tokenizer.decode(kept, skip_special_tokens=True)
-        return Generated(text, prompt.n_tokens, len(kept), "length" if ended is None else "stop", tuple(kept))
+            named = dict[str, float]()
+            for token, logprob in first.items():  # several may have one text
+                name = self.processor.tokenizer.decode([token])
+                named[name] = float(np.logaddexp(named.get(name, -np.inf), logprob))
+        finish = "length" if ended is None else "stop"
+        return Generated(text, prompt.n_tokens, len(kept), finish, tuple(kept), named)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs of a prompt or a batch, on the model's device, pictures in its precision."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.protocol.regimes import ANSWER_FROM
+from traps_pipeline.protocol.regimes import ANSWER_FROM, REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.graded_tables import WHY
 from traps_pipeline.report.tables.table_columns import ordered
@@ -14,34 +14,45 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LINES = ("-", "--", ":", "-.")
+_FROM = 0.2  # the likeliest of six answers is hardly less probable
+_APART = 0.008  # of the axis of probabilities, between the points of two models: several abstain and state alike
 
 
 def graded(results: Results) -> Figure:
-    """Return, for cuts of like probability of the likeliest answer, left the share of abstentions and right the mean
-    probability that is stated for this answer. Grey: an ideal observer, who abstains up to the probability from which
-    an answer is worth its risk, and states the true one. A step at another place is another threshold; a slope is
-    another knowledge."""
+    """Return the share of abstentions under regimes that ask for a decision (left), and the mean probability given to
+    the likeliest answer under regimes that ask for probabilities (right), over cuts whose likeliest answer is about
+    as probable. Grey: an ideal observer, who answers from the probability at which an answer is worth its risk, and
+    states the true one. A step at another place is another threshold; a slope is another knowledge. Models are drawn
+    side by side."""
+    from matplotlib.lines import Line2D
+
     rows = results.graded
-    rows = ordered(rows.loc[rows["scope"] != "all"], ["model", "regime"])
+    rows = ordered(rows.loc[rows["scope"] != "all"], ["model", "regime", "top"])
     if not len(rows):
         raise NotRun(WHY)
-    models, regimes = list(dict.fromkeys(rows["model"])), list(dict.fromkeys(rows["regime"]))
+    models, regimes = list(dict.fromkeys(rows["model"])), sorted(set(rows["regime"]), key=REGIMES.index)
     lines = {regime: _LINES[k % len(_LINES)] for k, regime in enumerate(regimes)}
+    states = set(rows.loc[rows["stated"].notna(), "regime"])
     with figure_style():
-        figure = new_figure(PAGE_IN, 2.7 + 0.12 * len(models))
+        figure = new_figure(PAGE_IN, 2.6 + 0.03 * (len(models) + len(regimes)))
         left, right = figure.subplots(1, 2)
-        ideal: dict[str, Any] = {"color": SOFT, "linewidth": 0.8, "zorder": 0.5}
-        left.plot([0.3, ANSWER_FROM, ANSWER_FROM, 1], [1, 1, 0, 0], label="ideal observer", **ideal)
-        right.plot([0.3, 1], [0.3, 1], **ideal)
-        for (model, regime), part in cast(Any, rows.sort_values("top").groupby(["model", "regime"], sort=False)):
-            k = models.index(model)
+        ideal: dict[str, Any] = {"color": SOFT, "linewidth": 2.5, "alpha": 0.45, "zorder": 0.5}
+        legend = left.plot([_FROM, ANSWER_FROM, ANSWER_FROM, 1], [1, 1, 0, 0], label="ideal observer", **ideal)
+        right.plot([_FROM, 1], [_FROM, 1], **ideal)
+        for k, model in enumerate(models):
             look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
-            look |= {"linestyle": lines[str(regime)], "markersize": 4, "clip_on": False}
-            left.plot(part["top"], 1 - part["coverage"], label=f"{plain(str(model))}, {regime}", **look)
-            right.plot(part["top"], part["stated"], **look)
-        left.set(xlim=(0.3, 1.0), ylim=(-0.03, 1.03), ylabel="share of abstentions")
-        right.set(xlim=(0.3, 1.0), ylim=(0.0, 1.03), ylabel="probability stated for it")
+            look |= {"markersize": 4, "clip_on": False}
+            legend.append(Line2D([], [], label=plain(str(model)), **look))
+            for regime in regimes:
+                part = rows.loc[rows["model"].eq(model) & rows["regime"].eq(regime)]
+                if not len(part):  # the layout makes room for an unclipped line of nothing
+                    continue
+                axes, share = (right, part["stated"]) if regime in states else (left, 1 - part["coverage"])
+                axes.plot(part["top"] + _APART * (k - len(models) / 2), share, linestyle=lines[regime], **look)
+        legend += [Line2D([], [], color=SOFT, linestyle=lines[one], label=f"regime {one}") for one in regimes]
+        left.set(ylim=(-0.03, 1.03), ylabel="share of abstentions")
+        right.set(ylim=(-0.03, 1.03), ylabel="mean probability given to it")
         for axes in (left, right):
-            axes.set_xlabel("probability of the likeliest answer")
-        figure.legend(loc="outside lower center", ncols=3, fontsize=6)
+            axes.set(xlim=(_FROM - 0.03, 1.03), xlabel="probability of the likeliest answer")
+        figure.legend(handles=legend, loc="outside lower center", ncols=5, fontsize=6)
     return figure
