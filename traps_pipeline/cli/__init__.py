@@ -48,15 +48,15 @@ START = """TRAPSBench: do vision-language models know when not to answer?
 
   traps doctor                  check this machine
   traps run demo                evaluate reference models; needs no key
-  traps plan mine.yaml          count calls and dollars of your own experiment; nothing is sent
+  traps plan mine.yaml          count calls and dollars; nothing is sent
   traps status                  say what is not fresh, and how to mend it
   traps why ITEM                show an item with its answers and votes
   traps site                    write the explorer of all answers and clips
 
 {groups}
 
-A group lists its commands, and `--help` behind a command shows an example. `traps completion bash` prints what a shell
-needs to complete them."""
+A group lists its commands, and `--help` behind a command shows an example.
+`traps completion bash` prints what a shell needs to complete them."""
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:

@@ -56,7 +56,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
-    example = "private --out commitment.json --reveal reveal.json"
+    example = "private --out public.json --reveal secret.json"
     parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
     parser.add_argument("benchmark", type=Path, help="a folder that `traps benchmark sample` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")

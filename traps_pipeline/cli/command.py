@@ -12,6 +12,7 @@ import math
 import os
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -54,6 +55,14 @@ def number(above: float, most: float) -> Callable[[str], float]:
         return float(text)
 
     return parse
+
+
+class LineWise(argparse.HelpFormatter):
+    """Help texts whose lines stay lines, each wrapped to the width of the terminal; an example is one to copy."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = (line if line.startswith("example: ") else textwrap.fill(line, width) for line in text.splitlines())
+        return "\n".join(lines)
 
 
 class Parser(argparse.ArgumentParser):
@@ -139,7 +148,7 @@ class Commands:
             help=text,
             description=text,
             epilog=shown + codes,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=LineWise,
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
