@@ -162,7 +162,7 @@ class Guard:
         return self._owner(_given_token(scope)) is not None
 
     def _owner(self, given: str | None) -> str | None:
-        """Whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
+        """Return whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
         owner = None
         for token, who in self._tokens.items():
             if given is not None and hmac.compare_digest(given.encode(), token.encode()):

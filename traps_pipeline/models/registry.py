@@ -206,7 +206,7 @@ class ModelEntry(Entry):
     @model_validator(mode="before")
     @classmethod
     def _local_models_take_their_time(cls, data: Any) -> Any:
-        """A local request waits for the batch before its own: giving it up would only throw its answer away."""
+        """Give local requests more time: each waits for the batch before its own, and giving up wastes its answer."""
         if isinstance(data, dict) and data.get("backend") == LOCAL and isinstance(data.get("limits", {}), dict):
             return data | {"limits": {"timeout_s": LOCAL_TIMEOUT_S} | data.get("limits", {})}
         return data

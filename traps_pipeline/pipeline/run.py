@@ -40,7 +40,7 @@ class WalkResult:
 
 @contextmanager
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
-    """Dagster's history of this workspace, opened by one process at a time (a first opening by two corrupts it).
+    """Open Dagster's history of this workspace, one process at a time: a first opening by two corrupts it.
 
     Runs whose process was killed are marked as failed: a queue would count them for ever. A history that is gone begins
     anew, and so does one that is no history any more, which is kept beside it: what counts stands in the tables.

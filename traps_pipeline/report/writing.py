@@ -347,7 +347,7 @@ def _parquet(table: PrintedTable) -> bytes:
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """The style of all figures, needed for drawing and for saving (the SVG salt takes effect only when saving)."""
+    """Apply the style of all figures; drawing and saving both need it (the SVG salt takes effect only when saving)."""
     import matplotlib.style
 
     with matplotlib.style.context(STYLE):

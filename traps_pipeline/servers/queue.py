@@ -23,8 +23,8 @@ MEANINGS: Mapping[QueueName, str] = {
 
 
 def flags(workspace: Workspace) -> pd.DataFrame:
-    """By scenario: how many judged answers have no unanimous panel (`judges`), and how evenly models are divided on the
-    controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
+    """Return by scenario how many judged answers have no unanimous panel (`judges`), and how evenly models are divided
+    on the controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
     rows = current_rows(workspace, VERDICTS, ["scenario_id", "item_id", "side", "n_valid", "correct", "unanimous"])
     judged = rows.loc[rows["n_valid"] > 0]
     split = (~judged["unanimous"].astype(bool)).groupby(judged["scenario_id"]).sum()

@@ -68,7 +68,7 @@ def beside(results: Results) -> pd.DataFrame:
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
-    """As `beside`, on the items that only look like voids, by probes of the datasets of their taxonomy."""
+    """Return what `beside` does for items that only look like voids, by probes of the datasets of their taxonomy."""
     probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
