@@ -9,6 +9,7 @@ import sys
 import textwrap
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
+from typing import TextIO
 
 from traps_pipeline.base.redaction import redact
 
@@ -56,9 +57,9 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
-def wrapped(text: str) -> str:
-    """Return a line for standard output; on a terminal it is broken between words."""
-    if not sys.stdout.isatty():
+def wrapped(text: str, stream: TextIO | None = None) -> str:
+    """Return a line for a stream (default: standard output); on a terminal it is broken between words."""
+    if not (stream or sys.stdout).isatty():
         return text
     return textwrap.fill(text, shutil.get_terminal_size().columns, break_long_words=False, break_on_hyphens=False)
 

@@ -18,7 +18,7 @@ from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from traps_pipeline.base.suggestions import did_you_mean, nearest
-from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.terminal import plain, wrapped
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
@@ -160,6 +160,12 @@ class Commands:
         if json:
             parser.add_argument("--json", action="store_true", help="print the result as JSON")
         return parser
+
+
+def print_failure(text: str) -> None:
+    """Print what went wrong to standard error, a line for each line of it; on a terminal words stay whole."""
+    for line in f"traps: {text}".splitlines():
+        print(wrapped(plain(line), sys.stderr), file=sys.stderr)
 
 
 def _show_help(arguments: argparse.Namespace) -> int:

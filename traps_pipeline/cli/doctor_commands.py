@@ -56,5 +56,5 @@ def doctor(arguments: argparse.Namespace) -> int:
         print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         problems += not finding.ok
     if summary[0]:
-        print(f"{problems} problem(s); {summary[0]}" if problems else summary[1])
+        print(f"{problems} problem{'s' * (problems != 1)}; {summary[0]}" if problems else summary[1])
     return FAILED if problems else OK
