@@ -140,14 +140,14 @@ class Commands:
         group, _, name = path.rpartition(" ")
         over = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
         codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {over}{INTERRUPTED} interrupted"
-        shown = (
+        example_line = (
             f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
         )
         parser = self._parsers[group].add_parser(
             name,
             help=text,
             description=text,
-            epilog=shown + codes,
+            epilog=example_line + codes,
             formatter_class=LineWise,
         )
         self.by_name[path] = parser
@@ -217,8 +217,8 @@ def listening_of(
 
     if arguments.behind:
         public_name(arguments.behind)
-    given = arguments.token or optional_key(variable)
-    token = token_for(arguments.host, given, danger=danger, variable=variable)
+    stated = arguments.token or optional_key(variable)
+    token = token_for(arguments.host, stated, danger=danger, variable=variable)
     tokens = personal_tokens(token, people) if people else token
     return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
 

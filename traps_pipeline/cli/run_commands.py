@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     about = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
     print(f"{wrapped(title, about)}\nworkspace {workspace.place}", file=about, flush=True)
-    with reporting(make_progress(arguments.progress)) as shown:
+    with reporting(make_progress(arguments.progress)) as progress:
         load_definitions()  # takes seconds, as Dagster's import does
         from traps_pipeline.pipeline.experiment_run import run_experiment
 
@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
             workspace,
             experiment,
             until=arguments.until,
-            preflight=None if arguments.no_preflight else shown.tell,
+            preflight=None if arguments.no_preflight else progress.tell,
             look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
             open_runs=partial(_open_runs, arguments),
         )
@@ -224,5 +224,5 @@ def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.report.tables.human_tables import said_by_people
     from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 
-    said = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
-    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST), said))
+    notes = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST), notes))

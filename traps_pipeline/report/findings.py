@@ -23,8 +23,8 @@ _SCORES = {"states": "states", "margin": "first token", "sentences": "whole abst
 _CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
 
 
-def _joined(said: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
-    return lambda results: " ".join(said(results))
+def _joined(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
+    return lambda results: " ".join(sentences(results))
 
 
 def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:

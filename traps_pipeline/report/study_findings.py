@@ -64,8 +64,8 @@ def _best(rows: pd.DataFrame) -> Iterator[Finding]:
 
 def _names(models: list[str]) -> str:
     """Return up to three names, and how many more there are."""
-    shown, more = models[:3], len(models) - 3
-    parts = [*shown, f"{more} more"] if more > 0 else shown
+    first, more = models[:3], len(models) - 3
+    parts = [*first, f"{more} more"] if more > 0 else first
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 

@@ -76,8 +76,8 @@ def look_alikes(results: Results) -> pd.DataFrame:
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
     probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
-    kept = probe[[*AT, "layer", "value", "low", "high", "n_voids", "n_controls"]]
-    table = kept.merge(by_features(results), on=AT, how="left")
+    states = probe[[*AT, "layer", "value", "low", "high", "n_voids", "n_controls"]]
+    table = states.merge(by_features(results), on=AT, how="left")
     return table.assign(mark=few(table, "n_voids", "n_controls"))
 
 
