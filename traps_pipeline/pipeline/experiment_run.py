@@ -122,5 +122,6 @@ def _preflight(workspace: Workspace, participants: _Participants, say: Callable[
 
     checks = preflight(workspace, models, participants.judges)
     for check in checks:
-        say(check.line)
+        if not check.problems:  # they are what is raised
+            say(check.line)
     require_sound(checks)
