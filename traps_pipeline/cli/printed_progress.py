@@ -158,7 +158,7 @@ class LiveProgress(PrintedProgress):
 
     def start(self) -> None:
         """See `PrintedProgress`."""
-        self._live.start()
+        self._live.start(refresh=True)
         super().start()
 
     def end_stage(self) -> None:
