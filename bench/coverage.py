@@ -28,7 +28,7 @@ from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN, taxonomy_o
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     TAXONOMIES,
-    Drawn,
+    Resampling,
     difference,
     draw_scenarios,
     figures_of,
@@ -127,7 +127,7 @@ class Setting:
         return np.stack([control > -acc, one, control < false_abs, one, void > -abs_rec, one], axis=-1).astype(float)
 
 
-def cell_figures(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
+def cell_figures(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
     """Return the ends of RESAMPLED of one dataset or arm, mean over runs: (studies, 2, RESAMPLED, 1 + resamples)."""
     scenarios, studies, runs, kinds = counts.shape
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
@@ -136,7 +136,7 @@ def cell_figures(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str, in
     return np.moveaxis(figures_of(whole, in_mean).mean(axis=2), 0, 1)
 
 
-def ends_now(counts: Mapping[str, np.ndarray], drawn: Drawn, model: str) -> dict[str, np.ndarray]:
+def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) -> dict[str, np.ndarray]:
     """Return the ends of every figure, (studies, 2, 1 + resamples), from counts by dataset and arm."""
 
     def ends_of(name: str, in_mean: bool) -> np.ndarray:

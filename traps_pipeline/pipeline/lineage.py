@@ -73,7 +73,7 @@ class Lineage:
         return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def made_at(self, name: str, key: str | None) -> int:
-        """When a partition was written (ns since 1970); 0 where there is none."""
+        """Return when a partition was written (ns since 1970); 0 where there is none."""
         stage = self.graph[name]
         path = _report_state(self._workspace, stage)
         if stage.table is not None:
@@ -171,7 +171,7 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[st
 
 
 def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None:
-    """What files for people (which are no table) were made from, in a folder beside them."""
+    """Write what a stage's files for people were made from, in a folder beside them."""
     workspace.store.write({_report_state(workspace, stage): json.dumps(asdict(state)).encode()})
 
 

@@ -105,7 +105,7 @@ class Pairs:
 
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
-        return [one for one, made in self.below.items() if key in made]
+        return [parent for parent, keys in self.below.items() if key in keys]
 
 
 @dataclass(frozen=True)

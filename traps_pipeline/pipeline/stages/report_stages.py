@@ -61,11 +61,11 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
     ]
     contents, remade = make_pieces(workspace, "report_page", code_of(GROUP), pieces)
     files = report_files(sources.study, [(name.partition("/")[0], Card.read(data)) for name, data in contents.items()])
-    shown = {
+    figures = {
         "made again": f"{len(remade)} of {len(pieces)}: {', '.join(remade[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
-    return StageOutput(files, shown=shown)
+    return StageOutput(files, shown=figures)
 
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))
