@@ -12,7 +12,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check
-	$(PYTEST) -n auto $(FAST)
+	$(PYTEST) -n auto $(FAST) --any-cpu # newer libraries may import longer
 
 # A number to look at, no threshold: what only slow tests reach counts as not reached.
 coverage: setup ## lines and branches of the package that the fast tests reach, by room and in all

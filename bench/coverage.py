@@ -3,13 +3,14 @@
 Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
 items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
 leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
-`--quick` takes half a minute of CPU; the full run six. `--csv FILE` keeps every setting; the printed tables have
-the lowest coverage and the mean width over the strengths and kinds of dependence of a size.
+`--quick` takes half a minute of CPU; the full run thirteen. `--csv FILE` keeps every setting; the printed tables have
+the lowest coverage and the mean width over the strengths and kinds of dependence of a size, and PECS by strength.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN, taxonomy_o
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     TAXONOMIES,
-    Drawn,
+    Resampling,
     difference,
     draw_scenarios,
     figures_of,
@@ -126,7 +127,7 @@ class Setting:
         return np.stack([control > -acc, one, control < false_abs, one, void > -abs_rec, one], axis=-1).astype(float)
 
 
-def cell_figures(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
+def cell_figures(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
     """Return the ends of RESAMPLED of one dataset or arm, mean over runs: (studies, 2, RESAMPLED, 1 + resamples)."""
     scenarios, studies, runs, kinds = counts.shape
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
@@ -135,7 +136,7 @@ def cell_figures(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str, in
     return np.moveaxis(figures_of(whole, in_mean).mean(axis=2), 0, 1)
 
 
-def ends_now(counts: Mapping[str, np.ndarray], drawn: Drawn, model: str) -> dict[str, np.ndarray]:
+def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) -> dict[str, np.ndarray]:
     """Return the ends of every figure, (studies, 2, 1 + resamples), from counts by dataset and arm."""
 
     def ends_of(name: str, in_mean: bool) -> np.ndarray:
@@ -282,8 +283,12 @@ def main() -> None:
     arguments = parse(parser, sizes=4, parts=1)
     settings = [Setting(*one) for one in product([*SIZES][: arguments.sizes], STRENGTHS, DEPENDENCE)]
     run = partial(mean_of_parts, parts=arguments.parts, seed=arguments.seed)
+    tables = list[pd.DataFrame]()
     with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
-        table = pd.concat(pool.map(run, settings, chunksize=6), ignore_index=True)
+        for setting, rows in zip(settings, pool.map(run, settings), strict=True):
+            tables.append(rows)
+            print(f"{len(tables)} of {len(settings)}: {', '.join(vars(setting).values())}", file=sys.stderr)
+    table = pd.concat(tables, ignore_index=True)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
     print(summary(table), by_strength(table), sep="\n\n")

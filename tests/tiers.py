@@ -31,12 +31,14 @@ ACCEPTED_SKIPS = {
     r"faults through every stage take an hour": "TRAPS_FAULTS=100 asks for them before a release",
 }
 CPU = pytest.StashKey[float]()
+SHARED_S = [0.0]  # CPU seconds of fixtures of the session, which count for no test
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of the campaign."""
     group = parser.getgroup("tiers")
     group.addoption("--shard", metavar="K/N", help="run the K-th of N parts of the selected tests, of equal CPU time")
+    group.addoption("--any-cpu", action="store_true", help="no limit to the CPU time of a fast test")
     group.addoption("--write-durations", action="store_true", help=f"store CPU seconds by file in {DURATIONS.name}")
 
 
@@ -131,16 +133,27 @@ def slowness() -> float:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item: pytest.Item) -> Generator[None, object, object]:
     """Note the CPU seconds before the test."""
-    item.stash[CPU] = cpu_s()
+    item.stash[CPU], SHARED_S[0] = cpu_s(), 0.0
     return (yield)
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Fail a test of `make check` that takes too much CPU time, its fixtures included."""
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, object, object]:
+    """Note what fixtures of the session take."""
+    began = cpu_s()
     result = yield
-    took = cpu_s() - item.stash[CPU]
-    if tier_of(item) == "check" and took > FAST_S and took > FAST_S * slowness():
+    if fixturedef.scope == "session":
+        SHARED_S[0] += cpu_s() - began
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Fail a test of `make check` that takes too much CPU time, its own fixtures included."""
+    result = yield
+    took = cpu_s() - item.stash[CPU] - SHARED_S[0]
+    limited = tier_of(item) == "check" and not item.config.getoption("--any-cpu")
+    if limited and took > FAST_S and took > FAST_S * slowness():
         pytest.fail(f"took {took:.1f} s of CPU, of {FAST_S:.0f} s: mark it slow, or promise", pytrace=False)
     return result
 

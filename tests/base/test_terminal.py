@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 
 import pytest
@@ -54,3 +55,16 @@ def test_a_terminal_gets_headings_with_a_rule_and_the_columns_that_fit(columns: 
     else:
         assert lines[0].split() == " ".join(HEADINGS).split()
         assert lines[3].endswith(REFUSED)
+
+
+def test_lines_of_a_terminal_are_broken_between_words_and_their_rest_is_indented() -> None:
+    text = f"stage is not fresh\n    reason: {'words ' * 20}end"
+    code = f"from traps_pipeline.base.terminal import wrapped; print(wrapped({text!r}))"
+    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    returned, screen = run_in_terminal([sys.executable, "-c", code], 80, 24, ROOT, environment)
+    first, reason, *rest = screen.text.splitlines()
+    assert returned == 0 and screen.widest <= 80
+    assert (first, reason[:18]) == ("stage is not fresh", "    reason: words ") and reason.endswith("words")
+    assert rest and all(line.startswith("        w") for line in rest)
+    piped = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert piped.stdout == text + "\n"

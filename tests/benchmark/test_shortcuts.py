@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.benchmark.shortcuts import shortcuts
+from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.video.encode import encode
 
 SCENARIOS = 10
@@ -72,3 +73,9 @@ def test_only_the_planted_cue_tells_control_from_void(
     assert (rows["n_pairs"] == SCENARIOS).all()
     assert (rows.loc[sorted(telling), "accuracy"] >= 0.8).all(), rows
     assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
+
+
+def test_no_interval_of_the_figure_goes_beyond_what_a_share_can_be(table: pd.DataFrame) -> None:
+    figure = shortcut_figure(table.assign(half_width=0.4))
+    ends = [x for bars in figure.axes[0].collections for segment in bars.get_segments() for x, _ in segment]  # type: ignore[attr-defined]
+    assert len(ends) > 10 and max(ends) == 1 and min(ends) >= 0

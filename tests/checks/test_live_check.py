@@ -12,10 +12,11 @@ from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
-from traps_pipeline.checks.live_check import Live, check_live
+from traps_pipeline.checks.live_check import Live, check_live, findings
 from traps_pipeline.models import api, registry
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
+from traps_pipeline.models.request import Outcome
 
 pytestmark = pytest.mark.slow
 NAME = "seer"
@@ -77,6 +78,14 @@ def test_an_error_in_a_200_is_named_as_one(
     with progress.reporting(progress.Progress()):
         assert all(cause in problem for problem in check().problems)
     assert "busy (an error object in an HTTP 200)" in capsys.readouterr().err
+
+
+def test_a_call_too_many_is_a_note_where_others_are_answered(check: Check) -> None:
+    entry, account, refused = check().entry, Account(key=KEY), Outcome("error", error="rate_limited")
+    answer = Outcome("answer", text="The answer is: red, then blue.")
+    live = findings(entry, account, {"clip": answer, "no clip": refused})
+    assert (live.problems, live.notes) == ([], ["no clip: refused as one call too many; a run waits and asks again"])
+    assert "takes no call now" in findings(entry, account, {"clip": refused, "no clip": refused}).problems[0]
 
 
 def test_a_proxy_that_is_dead_is_named_and_no_server_is_said_to_be_down(

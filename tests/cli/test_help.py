@@ -11,7 +11,7 @@ import pytest
 
 from tests.commands_page import PAGE, page
 from tests.conftest import ROOT
-from traps_pipeline.cli import GROUPS, build_parser, main
+from traps_pipeline.cli import GROUPS, START, build_parser, main
 from traps_pipeline.cli.command import SHORT
 
 
@@ -23,6 +23,13 @@ def test_the_examples_of_help_texts_can_be_given_as_they_stand() -> None:
         assert parsed.parser.prog == f"traps {path}"
         assert "exit codes: 0 done, 1 something failed, 2 bad usage, " in text
         assert ("4 a budget is reached" in text) == (path == "study run")
+
+
+def test_no_line_of_a_help_text_is_wider_than_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    parser = build_parser()
+    texts = [each.format_help() for each in (parser, *parser.commands.values())] + [START]
+    assert not [line for text in texts for line in text.splitlines() if len(line) > 80]
 
 
 def test_every_command_but_completion_stands_in_a_group_and_daily_ones_need_none() -> None:

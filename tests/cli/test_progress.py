@@ -47,7 +47,7 @@ def test_a_line_has_pace_latency_failures_money_and_time_left(clock: Clock) -> N
     report = Progress()
     ask(report, clock)
     # 40 calls in 40 s, whose median took 2.1 s; all calls of 2 of 4 cells are made, so as long again is left
-    line = "responses: 1 of 4, 1.0/s at 2.1 s, 1 errors, 1 retries, $11.00 of $50.00, 0:40 left"
+    line = "responses: 1 of 4, 1.0/s at 2.1 s, 1 error, 1 retry, $11.00 of $50.00, 0:40 left"
     assert report.line() == line
 
 
@@ -75,10 +75,13 @@ def test_a_log_has_a_line_for_each_stage_that_worked_and_one_for_all_tables(cloc
         report.partition(name, "a", Tally())
         report.partition(name, "b", Tally(), is_empty=name == "figure_patching")
     report.note("something\x1b[2J odd")
+    report.tell("ok   gpt\n     note its price is unknown")
     report.close()
     assert out.getvalue().splitlines() == [
         "responses: 1 of 4 made, 20 asked, 7 from the ledger, 1 failed, 1 retried, $10.00, 0:40",
         "! something?[2J odd",
+        "ok   gpt",
+        "     note its price is unknown",
         "5 tables and figures, 9 s",
     ]
     assert report.totals["responses"] == Tally(asked=20, cached=7, errors=1)
@@ -112,6 +115,9 @@ def test_a_terminal_has_one_region_at_its_bottom_that_leaves_nothing_behind(
     with terminal(columns, rows) as (ours, theirs), os.fdopen(os.dup(theirs), "w") as stream:
         report = make_progress("auto", stream)
         assert isinstance(report, LiveProgress)
+        screen.feed(read_all(ours))
+        assert screen.text.startswith("starting  0:0")  # imports take seconds
+        screen.frames.clear()
         report.money(1234.5, 5000.0)
         report.stage("confabulation_votes", 32)
         report.asking("responses", {f"a-model-with-a-rather-long-name-{n}": (12345, 0) for n in range(30)})

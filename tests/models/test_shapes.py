@@ -28,7 +28,10 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 
 # litellm serializes what it was given again; what it says of odd values goes to nobody.
-pytestmark = pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Pydantic serializer warnings"),
+    pytest.mark.usefixtures("client_library"),
+]
 USD_A_TOKEN = (1e-6, 1e-5)
 
 

@@ -31,10 +31,11 @@ from traps_pipeline.storage.study import Study
 
 PROXIES = ("http_proxy", "https_proxy", "all_proxy", "no_proxy")
 MODEL = "m"
+LONG_S = 300.0
 
 
 @pytest.fixture(autouse=True)
-def environment(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+def environment(client_library: None, monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """A key and no word about proxies and certificates."""
     for name in (*PROXIES, *(name.upper() for name in PROXIES), "SSL_CERT_FILE", "SSL_CERT_DIR"):
         monkeypatch.delenv(name, raising=False)
@@ -42,7 +43,7 @@ def environment(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-async def asking(base_url: str, budget: Budget, timeout_s: float = 20.0, **limits: int) -> Outcome | None:
+async def asking(base_url: str, budget: Budget, timeout_s: float = LONG_S, **limits: int) -> Outcome | None:
     """One call to an address with its retries."""
     account, entry = Account(key=KEY, base_url=base_url), entry_of(MODEL)
     entry = entry.model_copy(update={"limits": entry.limits.model_copy(update={"timeout_s": timeout_s, **limits})})
@@ -51,13 +52,13 @@ async def asking(base_url: str, budget: Budget, timeout_s: float = 20.0, **limit
     return attempted and attempted[0]
 
 
-def call(base_url: str, timeout_s: float = 20.0, **limits: int) -> tuple[Outcome | None, float]:
+def call(base_url: str, timeout_s: float = LONG_S, **limits: int) -> tuple[Outcome | None, float]:
     """What came of one call, and what the budget says that it cost."""
     budget = budget_of(10.0)
     return asyncio.run(asking(base_url, budget, timeout_s, **limits)), budget.spent_usd
 
 
-def unsent(capsys: pytest.CaptureFixture[str], base_url: str, timeout_s: float = 20.0) -> str:
+def unsent(capsys: pytest.CaptureFixture[str], base_url: str, timeout_s: float = LONG_S) -> str:
     """What is said of a call that never left; it cost nothing, and its row says no cost."""
     with progress.reporting(progress.Progress()):
         outcome, booked_usd = call(base_url, timeout_s)

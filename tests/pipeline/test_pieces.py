@@ -95,3 +95,26 @@ def test_a_picture_is_made_again_when_the_rows_that_it_shows_change_and_not_with
     versions["metrics/chaotic"] = "2"
     assert made_again(["plinko-0001"]) == []
     assert made_again(["plinko-0002"]) == ["sheet"]
+
+
+def test_what_all_studies_have_in_common_is_made_once_for_a_user(
+    tmp_path: Path, versions: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = list[str]()
+
+    def make(study: str, code: str = "1") -> bytes:
+        def paper() -> bytes:
+            made.append(study)
+            return f"made in {study} by {code}".encode()
+
+        workspace = Workspace.create(tmp_path / study, Study())
+        contents, remade = make_pieces(workspace, "report_page", code, [Piece("paper", paper, is_shared=True)])
+        assert remade == ["paper"]
+        return contents["paper"]
+
+    assert {make("first"), make("second")} == {b"made in first by 1"}
+    assert made == ["first"]
+    assert make("third", code="2") == b"made in third by 2"
+    (tmp_path / "cache" / "traps" / "report_page.pieces.zip").write_bytes(b"damaged")
+    assert make("fourth", code="2") == b"made in fourth by 2"

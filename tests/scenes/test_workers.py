@@ -34,3 +34,11 @@ def test_after_a_worker_died_the_next_call_has_others_and_after_an_early_stop_th
         _, one = next(results)
         results.close()  # type: ignore[attr-defined]
         assert {pid for _, pid in run_in_order(who, range(2), 1)} == {one}
+
+
+def test_ctrl_c_says_what_it_waits_for(capsys: pytest.CaptureFixture[str]) -> None:
+    results = run_in_order(who, count(), 1)
+    next(results)
+    with pytest.raises(KeyboardInterrupt):
+        results.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
+    assert "stopping: waiting for what the workers have begun" in capsys.readouterr().err

@@ -83,6 +83,15 @@ def test_no_p_is_below_that_of_a_sign_flip_over_all_scenarios(n, rows):
     assert table["separable"].isna().all() == (2.0 ** (1 - n) >= 0.05)
 
 
+def test_p_counts_the_resamples_on_the_other_side_and_adds_one(rows):
+    # Of nine resamples k > 0 lie beyond 0: p is 2 (k + 1) / 10, and not 2 k / 9.
+    better, worse = pairs_with(40, 20, 0, 40), pairs_with(40, 15, 0, 40)
+    table = scored(rows(better, model="m"), rows(worse[::-1], model="n"), resamples=9)[2]
+    p = only(table, kind="models", dataset="occlusion", figure="pecs")["p"]
+    assert p < 1
+    assert 5 * p == pytest.approx(round(5 * p))
+
+
 def test_two_scenarios_are_too_few_and_their_ranks_stay_open(rows):
     right, wrong = [(True, False, True)] * 2, [(False, False, True)] * 2
     parts = [rows(pairs, dataset=d, model=m) for d in DATASETS for m, pairs in (("m", right), ("n", wrong))]

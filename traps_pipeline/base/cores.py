@@ -8,6 +8,6 @@ CORES = "TRAPS_CORES"  # of a run on a cluster; set by who submits it
 
 
 def cores() -> int:
-    """At least one."""
+    """Return the number of cores to use, at least one."""
     here, setting = len(os.sched_getaffinity(0)), os.environ.get(CORES)
     return min(here, max(1, int(setting))) if setting else here

@@ -39,7 +39,7 @@ def remedy(error: OSError) -> str:
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """A path beside `path` for the block to write to. At the block's end the file there takes the place of `path`.
+    """Yield a path beside `path` for the block to write to; at its end that file takes the place of `path`.
 
     Until then, and after an error, Ctrl-C or a kill, `path` is what it was before. An unfinished file is removed. Only
     a kill leaves it, hidden and named `*.part`; nothing reads it. Missing folders are made.

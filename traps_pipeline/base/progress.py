@@ -227,7 +227,8 @@ class Progress:
             parts.append(now.detail)
         if total.wanted:
             parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"]
-            parts += [f"{count:,} {name}" for name in ("errors", "retries") if (count := getattr(total, name))]
+            parts += [f"{total.errors:,} error{'s' * (total.errors != 1)}"] if total.errors else []
+            parts += [f"{total.retries:,} {'retry' if total.retries == 1 else 'retries'}"] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
         if now.left_s is not None:
             parts.append(f"{clock(now.left_s)} left")

@@ -186,7 +186,7 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
             places.append((place, end))
         place = end
     searched = "".join(characters)
-    for piece, (form, place) in ((piece, each) for piece, found in pieces.items() for each in found):
+    for piece, (form, place) in ((piece, each) for piece, every in pieces.items() for each in every):
         start = searched.find(piece)
         while start >= 0:
             before, behind = searched[max(0, start - place) : start], searched[start : start + len(form) - place]

@@ -9,6 +9,7 @@ import sys
 import textwrap
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
+from typing import Any, TextIO
 
 from traps_pipeline.base.redaction import redact
 
@@ -56,11 +57,21 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
-def wrapped(text: str) -> str:
-    """Return a line for standard output; on a terminal it is broken between words."""
-    if not sys.stdout.isatty():
+def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
+    """Return lines for a stream (default: standard output); on a terminal each is broken between words.
+
+    hang: columns by which the rest of a line stands further in (default: 4 where the line is indented, else 0).
+    """
+    if not (stream or sys.stdout).isatty():
         return text
-    return textwrap.fill(text, shutil.get_terminal_size().columns, break_long_words=False, break_on_hyphens=False)
+    columns = shutil.get_terminal_size().columns
+    lines = []
+    for line in text.split("\n"):
+        indent = len(line) - len(line.lstrip())
+        further = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
+        how: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
+        lines.append(textwrap.fill(line, columns, **how))
+    return "\n".join(lines)
 
 
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> str:

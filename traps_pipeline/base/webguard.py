@@ -49,21 +49,21 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def token_for(host: str, given: str | None, *, danger: str, variable: str) -> str:
+def token_for(host: str, token: str | None, *, danger: str, variable: str) -> str:
     """Return the token of a server that listens there: the given one, or a fresh one. Raises TrapsError beyond this
     machine without one, and for one that can be guessed.
 
     danger: what everybody who reaches the address could do; variable: the environment variable that may hold a token.
     """
-    if given is None and not is_loopback(host):
+    if token is None and not is_loopback(host):
         raise TrapsError(
             f"--host {host}: everybody who reaches that address could {danger}; "
             f"give a token of your own (--token, or {variable}), and put a server that speaks HTTPS before it, "
             "since the token crosses the network; or leave --host out and use an SSH tunnel"
         )
-    if given is not None and (len(given) < LEAST_TOKEN or not given.isascii() or not given.isprintable()):
+    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         raise TrapsError(f"--token: {LEAST_TOKEN} or more printable ASCII characters, so that it cannot be guessed")
-    return given or secrets.token_urlsafe(24)
+    return token or secrets.token_urlsafe(24)
 
 
 def public_name(address: str) -> str:
@@ -161,19 +161,19 @@ class Guard:
             return False
         return self._owner(_given_token(scope)) is not None
 
-    def _owner(self, given: str | None) -> str | None:
-        """Whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
+    def _owner(self, token_given: str | None) -> str | None:
+        """Return whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
         owner = None
         for token, who in self._tokens.items():
-            if given is not None and hmac.compare_digest(given.encode(), token.encode()):
+            if token_given is not None and hmac.compare_digest(token_given.encode(), token.encode()):
                 owner = who
         return owner
 
     def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
         """Return whose cookie or `Authorization: Bearer TOKEN` a request brings; None where it is nobody's."""
-        scheme, _, given = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
+        scheme, _, token = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
         if scheme.lower() == "bearer":
-            return self._owner(given.strip())
+            return self._owner(token.strip())
         try:
             cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
         except CookieError:
@@ -212,9 +212,9 @@ def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             own = {name for name, _ in _HEADERS if name != b"cache-control"}
-            sent = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in own]
-            cached = any(name.lower() == b"cache-control" for name, _ in sent)
-            message["headers"] = [*sent, *(each for each in _HEADERS if not cached or each[0] != b"cache-control")]
+            headers = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in own]
+            cached = any(name.lower() == b"cache-control" for name, _ in headers)
+            message["headers"] = [*headers, *(each for each in _HEADERS if not cached or each[0] != b"cache-control")]
         await send(message)
 
     return sending

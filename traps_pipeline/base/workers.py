@@ -15,6 +15,7 @@ from itertools import chain, islice
 from multiprocessing import get_context
 from typing import TypeVar
 
+from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 
 JOBS_A_WORKER = 100  # GL drivers leak: a worker does so many jobs, then another takes over
@@ -113,6 +114,10 @@ def _in_order(
             submit(at_once)
             yield job, result
             submit(not at_once)
+    except BaseException as error:
+        if not isinstance(error, Exception | GeneratorExit):  # Ctrl-C
+            progress.current().note("stopping: waiting for what the workers have begun")
+        raise
     finally:
         wait([future for _, future in pending if not future.cancel()])
 

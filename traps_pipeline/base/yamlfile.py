@@ -204,21 +204,21 @@ def parse_yaml_model(
     return parsed
 
 
-def _other_kinds(data: Any, made: Any, name: str = "") -> Iterator[str]:
+def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
     """Yield values that a model took for another kind: true for 1, a text for a number; and no numbers."""
-    if isinstance(made, float) and not math.isfinite(made):
-        yield f"{name}: {made} is no finite number"
-    number = isinstance(made, int | float) and not isinstance(made, bool)
-    if (number and isinstance(data, bool | str)) or (isinstance(made, bool) and not isinstance(data, bool)):
+    if isinstance(validated, float) and not math.isfinite(validated):
+        yield f"{name}: {validated} is no finite number"
+    number = isinstance(validated, int | float) and not isinstance(validated, bool)
+    if (number and isinstance(data, bool | str)) or (isinstance(validated, bool) and not isinstance(data, bool)):
         yield f"{name}: {data!r:.60} is no {'number' if number else 'true or false'}"
     fields = {}
-    if isinstance(data, Mapping) and isinstance(made, BaseModel):
-        aliases = {info.alias or field: field for field, info in type(made).model_fields.items()}
-        fields = {key: (data[key], getattr(made, str(aliases.get(key, key)), None)) for key in data}
-    elif isinstance(data, Mapping) and isinstance(made, Mapping):
-        fields = {key: (data[key], made[key]) for key in data if key in made}
-    elif isinstance(data, list | tuple) and isinstance(made, list | tuple):
-        fields = dict(enumerate(zip(data, made, strict=False)))
+    if isinstance(data, Mapping) and isinstance(validated, BaseModel):
+        aliases = {info.alias or field: field for field, info in type(validated).model_fields.items()}
+        fields = {key: (data[key], getattr(validated, str(aliases.get(key, key)), None)) for key in data}
+    elif isinstance(data, Mapping) and isinstance(validated, Mapping):
+        fields = {key: (data[key], validated[key]) for key in data if key in validated}
+    elif isinstance(data, list | tuple) and isinstance(validated, list | tuple):
+        fields = dict(enumerate(zip(data, validated, strict=False)))
     for key, (raw, value) in fields.items():
         yield from _other_kinds(raw, value, f"{name}.{key}" if name else str(key))
 

@@ -66,11 +66,11 @@ def certify_all(
     return verdicts, failures + _alike(verdicts) + foreseeable(specs, verdicts)
 
 
-def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
+def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
     trajectory = released / "trajectories" / f"{spec.scenario_id}.npz"
     content = file_digest(trajectory) if trajectory.is_file() else "missing"
     name = digest([spec.spec_hash, content, code_digest(spec.family)])[:24]
-    return Case(spec, trajectory, kept / f"{spec.scenario_id}-{name}.json")
+    return Case(spec, trajectory, folder / f"{spec.scenario_id}-{name}.json")
 
 
 @cache
@@ -141,13 +141,13 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
         *("margin m", "twins", "CPU s", "other physics"),
     )
     rows = []
-    for family, found in sorted(members.items()):
-        twins = sum("twin" not in v.failures and "record" not in v.failures for v in found)
+    for family, mine in sorted(members.items()):
+        twins = sum("twin" not in v.failures and "record" not in v.failures for v in mine)
         rejected = tallies.get(family, Tally(0, 0)).rejected.total()
-        others = sum(not v.same_physics for v in found)
-        spans = (_span(found, "entropy_bits", 2), _span(found, "top_share", 2), _span(found, "margin_m", 3))
-        seconds = f"{np.median([v.cpu_s for v in found]):.1f}"
-        rows.append((family, len(found), sum(v.passed for v in found), rejected, *spans, twins, seconds, others))
+        others = sum(not v.same_physics for v in mine)
+        spans = (_span(mine, "entropy_bits", 2), _span(mine, "top_share", 2), _span(mine, "margin_m", 3))
+        seconds = f"{np.median([v.cpu_s for v in mine]):.1f}"
+        rows.append((family, len(mine), sum(v.passed for v in mine), rejected, *spans, twins, seconds, others))
     lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(

@@ -102,12 +102,12 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
 def seconds_left(workspace: Workspace, category: str) -> float:
     """Estimate how long one core films what is missing of a category's arms, as far as released records tell."""
-    found = [
+    clips = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()
         for arm in asked_arms(workspace, category)
     ]
-    return SECONDS_AN_ARM * (len(found) - len(workspace.store.there(found)))
+    return SECONDS_AN_ARM * (len(clips) - len(workspace.store.there(clips)))
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
@@ -243,11 +243,11 @@ def _rows(
     for question in arm_of(spec, arm).ask(spec):
         of_pair = question.clip
         if of_pair is not None:
-            shown = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+            columns = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
         else:
             assert clip is not None, "what shows a clip of its own has frames"
-            shown = _shown(workspace.relative(path), clip)
-        yield replace(empty, **shown, **_asked(question, spec))
+            columns = _shown(workspace.relative(path), clip)
+        yield replace(empty, **columns, **_asked(question, spec))
 
 
 def _asked(question: Question, spec: SceneSpec) -> dict[str, Any]:

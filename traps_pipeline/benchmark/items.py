@@ -78,9 +78,9 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
         for row in workspace.tables.read_all(VIDEOS, category=categories_of_dataset(dataset)).to_dict("records")
         if row["scene_hash"] == scenes.get(row["scenario_id"])
     }
-    drawn = [spec for spec in specs if all((spec["scenario_id"], side) in clips for side in SIDES)]
+    complete = [spec for spec in specs if all((spec["scenario_id"], side) in clips for side in SIDES)]
     commonest = commonest_answers(specs)
-    return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in drawn for side in SIDES]
+    return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in complete for side in SIDES]
 
 
 def _of_arm(

@@ -63,12 +63,12 @@ class _Sharing(Generic[Job]):
         self._drawing = deque[tuple[Row, Lease]]()  # in the order of the jobs
 
     def work(self, *, wait: bool) -> tuple[int, bool]:
-        drawn = 0
+        n_frames = 0
         try:
             while self._left:
                 # The next row is drawn while files are handed over, and is leased no sooner.
                 for _, frames in run_in_order(self._of.draw, self._jobs(), at_once=True):
-                    drawn += frames
+                    n_frames += frames
                     self._finish(*self._drawing.popleft())
                 if not wait:
                     break
@@ -77,7 +77,7 @@ class _Sharing(Generic[Job]):
         finally:
             for _, lease in self._drawing:
                 lease.close()
-        return drawn, not self._left
+        return n_frames, not self._left
 
     def _jobs(self) -> Iterator[Job]:
         """Yield jobs of the rows that nobody else has, each leased when its job is asked for."""

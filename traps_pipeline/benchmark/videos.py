@@ -44,18 +44,18 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
     tick = partial(_tick, category, len(specs))
     rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, _render)
-    drawn, is_whole = share(workspace.store, specs, rendering, tick, wait=wait)
-    if drawn and rendered is not None:
+    frames, is_whole = share(workspace.store, specs, rendering, tick, wait=wait)
+    if frames and rendered is not None:
         rendered.trim()
-    return drawn, is_whole
+    return frames, is_whole
 
 
 def _render(job: Job) -> int:
     """Render what is missing of a pair and its twin, and keep it for other studies; return the number of frames."""
-    drawn, rendered = render_pair(job), ClipCache.of_user()
+    frames, rendered = render_pair(job), ClipCache.of_user()
     if rendered is not None:
         rendered.keep(job.clips, job.spec.scene_hash)
-    return drawn
+    return frames
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:

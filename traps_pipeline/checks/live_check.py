@@ -31,7 +31,15 @@ from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.models.participants import Row
 from traps_pipeline.models.reading import degenerate, read_answer
 from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of
-from traps_pipeline.models.request import MALFORMED, UNFINISHED, WITH_TEXT, Outcome, Request, TransientError
+from traps_pipeline.models.request import (
+    MALFORMED,
+    RATE_LIMITED,
+    UNFINISHED,
+    WITH_TEXT,
+    Outcome,
+    Request,
+    TransientError,
+)
 from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
@@ -177,7 +185,10 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
             continue  # what fails without a schema, too, says nothing of schemas
         if outcome.kind == "error":
             sentence = _failure(entry, account, name, str(outcome.error))
-            (notes if outcome.error == "timeout" else problems).append(sentence)
+            if outcome.error == RATE_LIMITED and any(one.kind in WITH_TEXT for one in outcomes.values()):
+                notes.append(f"{name}: refused as one call too many; a run waits and asks again")
+            else:
+                (notes if outcome.error == "timeout" else problems).append(sentence)
         elif outcome.kind == "malformed":
             odd = None if outcome.error == MALFORMED else outcome.error
             problems.append(f"{name}: {odd or 'its answer has no shape of its API; what it is stands above'}")

@@ -142,7 +142,7 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
-    """Exactly the fields that a body of an API must have, by dotted name."""
+    """Return exactly the fields that a body of an API must have, by dotted name."""
     fields: dict[str, Any] = {}
     for name, value in params.items():
         if name == "response_format":

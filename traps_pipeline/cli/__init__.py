@@ -33,7 +33,7 @@ from traps_pipeline.cli import (
     status_commands,
     ui_commands,
 )
-from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run, print_failure
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GROUPS = {
@@ -48,15 +48,15 @@ START = """TRAPSBench: do vision-language models know when not to answer?
 
   traps doctor                  check this machine
   traps run demo                evaluate reference models; needs no key
-  traps plan mine.yaml          count calls and dollars of your own experiment; nothing is sent
+  traps plan mine.yaml          count calls and dollars; nothing is sent
   traps status                  say what is not fresh, and how to mend it
   traps why ITEM                show an item with its answers and votes
   traps site                    write the explorer of all answers and clips
 
 {groups}
 
-A group lists its commands, and `--help` behind a command shows an example. `traps completion bash` prints what a shell
-needs to complete them."""
+A group lists its commands, and `--help` behind a command shows an example.
+`traps completion bash` prints what a shell needs to complete them."""
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
@@ -85,22 +85,20 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
     except BrokenPipeError:
         raise
     except TrapsError as error:
-        print("\n".join(plain(line) for line in f"traps: {error}".splitlines()), file=sys.stderr)
+        print_failure(str(error))
         return FAILED
     except ModuleNotFoundError as error:
         if (sentence := sentence_of(error)) is None:
             raise
-        print(f"traps: {sentence}", file=sys.stderr)
+        print_failure(sentence)
         return FAILED
     except OSError as error:
         where = f"{plain(error.filename)[:200]}: " if error.filename else ""
-        print(f"traps: {where}{error.strerror}; {remedy(error)} and run the same command again", file=sys.stderr)
+        print_failure(f"{where}{error.strerror}; {remedy(error)} and run the same command again")
         return FAILED
     except KeyboardInterrupt:
-        print(
-            "\ntraps: interrupted; every finished answer and clip is kept. Run the same command to continue.",
-            file=sys.stderr,
-        )
+        print(file=sys.stderr)
+        print_failure("interrupted; every finished answer and clip is kept. Run the same command to continue.")
         return INTERRUPTED
     finally:
         for stream in (sys.stdout, sys.stderr):

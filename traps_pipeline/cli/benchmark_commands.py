@@ -56,7 +56,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
-    example = "private --out commitment.json --reveal reveal.json"
+    example = "private --out public.json --reveal secret.json"
     parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
     parser.add_argument("benchmark", type=Path, help="a folder that `traps benchmark sample` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
@@ -113,7 +113,7 @@ def sample(arguments: argparse.Namespace) -> int:
     uncounted = [name for name in names if name not in counts]
     if uncounted and not arguments.count:
         raise TrapsError(f"composition.yaml has no number of scenarios for {', '.join(uncounted)}; say --count N")
-    wanted = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
+    targets = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
     name = arguments.name or f"private-{arguments.seed}"
     try:
         check_name(name)
@@ -121,18 +121,18 @@ def sample(arguments: argparse.Namespace) -> int:
         raise TrapsError(f"--name: {error}") from None
     sample_benchmark(
         arguments.out.absolute(),
-        wanted,
+        targets,
         arguments.seed,
         name,
         look=arguments.look,
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )
-    print(f"{sum(wanted.values())} scenarios of {len(wanted)} families in {arguments.out}")
-    there = load_release(arguments.out.absolute() / "benchmark.yaml").name
+    print(f"{sum(targets.values())} scenarios of {len(targets)} families in {arguments.out}")
+    benchmark = load_release(arguments.out.absolute() / "benchmark.yaml").name
     print(
         f"next: traps benchmark certify --specs {arguments.out}; to run studies on it, "
-        f"TRAPS_SCENE_SPECS={arguments.out} and `benchmark: {there}` in the experiment"
+        f"TRAPS_SCENE_SPECS={arguments.out} and `benchmark: {benchmark}` in the experiment"
     )
     return OK
 
@@ -141,8 +141,8 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
     """See `traps benchmark commit --help`."""
     from traps_pipeline.release.commitment import commit
 
-    made = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
-    print(f"{len(made.specs)} records of {made.name} {made.version} are committed in {arguments.out}: publish it")
+    public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
+    print(f"{len(public.specs)} records of {public.name} {public.version} are committed in {arguments.out}: publish it")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
 

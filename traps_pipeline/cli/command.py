@@ -12,14 +12,17 @@ import math
 import os
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from traps_pipeline.base.suggestions import did_you_mean, nearest
-from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.terminal import plain, wrapped
 
 if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
     from traps_pipeline.pipeline.experiment import Experiment
     from traps_pipeline.servers.server import Listening
     from traps_pipeline.storage.place import Place
@@ -54,6 +57,14 @@ def number(above: float, most: float) -> Callable[[str], float]:
         return float(text)
 
     return parse
+
+
+class LineWise(argparse.HelpFormatter):
+    """Help texts whose lines stay lines, each wrapped to the width of the terminal; an example is one to copy."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = (line if line.startswith("example: ") else textwrap.fill(line, width) for line in text.splitlines())
+        return "\n".join(lines)
 
 
 class Parser(argparse.ArgumentParser):
@@ -98,6 +109,11 @@ class Parser(argparse.ArgumentParser):
             message += did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3]))
         super().error(message)
 
+    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
+        """Write a message. Raises BrokenPipeError, which `argparse` swallows from Python 3.11.3 on."""
+        if message and (stream := file or sys.stderr):
+            stream.write(message)
+
 
 class Commands:
     """The commands of a parser, some of them in groups. by_name: their parsers."""
@@ -131,15 +147,15 @@ class Commands:
         group, _, name = path.rpartition(" ")
         over = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
         codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {over}{INTERRUPTED} interrupted"
-        shown = (
+        example_line = (
             f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
         )
         parser = self._parsers[group].add_parser(
             name,
             help=text,
             description=text,
-            epilog=shown + codes,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            epilog=example_line + codes,
+            formatter_class=LineWise,
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
@@ -151,6 +167,12 @@ class Commands:
         if json:
             parser.add_argument("--json", action="store_true", help="print the result as JSON")
         return parser
+
+
+def print_failure(text: str) -> None:
+    """Print what went wrong to standard error, a line for each line of it; on a terminal words stay whole."""
+    for line in f"traps: {text}".splitlines():
+        print(wrapped(plain(line), sys.stderr), file=sys.stderr)
 
 
 def _show_help(arguments: argparse.Namespace) -> int:
@@ -202,8 +224,8 @@ def listening_of(
 
     if arguments.behind:
         public_name(arguments.behind)
-    given = arguments.token or optional_key(variable)
-    token = token_for(arguments.host, given, danger=danger, variable=variable)
+    stated = arguments.token or optional_key(variable)
+    token = token_for(arguments.host, stated, danger=danger, variable=variable)
     tokens = personal_tokens(token, people) if people else token
     return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.terminal import plain, wrapped
 from traps_pipeline.cli.command import FAILED, OK, Commands, place_of, print_json
 
 
@@ -53,8 +53,9 @@ def doctor(arguments: argparse.Namespace) -> int:
         return OK if all(finding.ok for finding in checked) else FAILED
     problems = 0
     for finding in findings:
-        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
+        line = f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}"
+        print(wrapped(line, hang=5), flush=True)
         problems += not finding.ok
     if summary[0]:
-        print(f"{problems} problem(s); {summary[0]}" if problems else summary[1])
+        print(f"{problems} problem{'s' * (problems != 1)}; {summary[0]}" if problems else summary[1])
     return FAILED if problems else OK

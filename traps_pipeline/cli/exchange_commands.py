@@ -71,8 +71,8 @@ def import_given(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     whose = Whose(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
-    found = import_answers(open_workspace(arguments), experiment, arguments.file, whose, arguments.errors)
-    return _imported(found, arguments, "answers")
+    imported = import_answers(open_workspace(arguments), experiment, arguments.file, whose, arguments.errors)
+    return _imported(imported, arguments, "answers")
 
 
 def export_votes(arguments: argparse.Namespace) -> int:

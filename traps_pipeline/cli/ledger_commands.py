@@ -14,7 +14,7 @@ def add(commands: Commands) -> None:
     text = "write answers, votes and money to one file, as they are"
     parser = commands.add("study export-ledger", export, text, example="ledger.sqlite")
     parser.add_argument("file", type=Path, metavar="FILE", help="to be made")
-    text = "read such a file into a study that has no answers yet: in its folder, or in the database of study.yaml"
+    text = "read an exported ledger into a study without answers: in its folder, or in the database of study.yaml"
     parser = commands.add("study import-ledger", import_, text, example="ledger.sqlite")
     parser.add_argument("file", type=Path, metavar="FILE", help="of `traps study export-ledger`")
     text = "move the whole study into an object store that several hosts share"
@@ -22,7 +22,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--store", metavar="ADDRESS", required=True, help="s3://BUCKET/STUDY")
 
     text = "give back money that is booked for calls that never left; without arguments: list what may be released"
-    example = '--participant my-model --all-in-flight --why "the process was killed"'
+    example = "--participant qwen --usd 1.50 --why killed"
     parser = commands.add("study release-money", release, text, example=example, json=True)
     parser.add_argument("--participant", metavar="NAME", help="the model or judge whose money it is")
     amount = parser.add_mutually_exclusive_group()

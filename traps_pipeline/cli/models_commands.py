@@ -85,12 +85,12 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     entries = [known[name] for name in names if known[name].backend == NETWORK]
     if not entries:
         raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
-    found = check_live(entries)
+    checks = check_live(entries)
     if is_json:
-        print_json(found)
-    for one in () if is_json else found:
+        print_json(checks)
+    for one in () if is_json else checks:
         print(one.line, flush=True)
-    return FAILED if any(one.problems for one in found) else OK
+    return FAILED if any(one.problems for one in checks) else OK
 
 
 def test_panel(arguments: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from math import comb
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.terminal import text_table, wrapped
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -54,7 +54,8 @@ def plan(arguments: argparse.Namespace) -> int:
         print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
         return OK
     total = (Count(), Count())
-    print(f"{experiment.name} in {place if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
+    where = place if workspace else "a new workspace"
+    print(wrapped(f"{experiment.name} in {where}: calls wanted, known (in the ledger), new"))
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
     if planned.labels is not None:
         rows["confabulation labels"] = (Count(), planned.labels)
@@ -73,10 +74,11 @@ def plan(arguments: argparse.Namespace) -> int:
         _print_local(planned.local, arguments.card)
     _print_precision(planned.pairs, len(planned.calls))
     if planned.uncertain:
-        print(
+        text = (
             f"This is an upper bound: items of {', '.join(planned.uncertain)} are still to be made, so all of their "
             "calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
+        print(wrapped(text))
     return OK
 
 
@@ -85,17 +87,16 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
 
     if any(pairs.values()):
         expected, middling = precision(pairs, models=models), Shares()
-        print(
+        text = (
             f"\nprecision with {sum(pairs.values()):,} pairs: a model with Acc {middling.acc:.0%}, AbsRec "
             f"{middling.abs_rec:.0%}, FalseAbs {middling.false_abs:.0%} (PECS {middling.pecs:.2f}) gets a 95 % "
             f"interval of PECS about {expected.width:.3f} wide; of two models with unrelated answers "
             f"{_difference(expected.difference)} is found in 80 % of studies"
         )
         if models > 2:
-            print(
-                f"of {models} models, after Holm's correction over their {comb(models, 2)} pairs: "
-                f"{_difference(expected.among_all)}"
-            )
+            among = f"of {models} models, after Holm's correction over their {comb(models, 2)} pairs"
+            text += f"\n{among}: {_difference(expected.among_all)}"
+        print(wrapped(text))
 
 
 def _difference(least: float | None) -> str:
@@ -117,15 +118,17 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
         )
         for row in forecasts
     ]
-    rows.append(("all: models, then judges", f"{calls:,}", "", *_dollars(total), f"{minutes:,.0f}"))
-    headings = ("over the network", "new calls", "M tokens in, out", "USD low", "expected", "high", "minutes")
+    rows.append(("all", f"{calls:,}", "", *_dollars(total), f"{minutes:,.0f}"))
+    headings = ("over the network", "calls", "tokens (M)", "USD low", "expected", "high", "minutes")
     print(f"\n{text_table(headings, rows)}")
+    print("tokens: millions read, written; minutes of all: models, then judges")
     in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if in_batches < total[1]:
-        print(f"expected if all calls are made in batches (traps study export-requests --batch): USD {in_batches:,.2f}")
+        how = "expected if all calls are made in batches (traps study export-requests --batch)"
+        print(wrapped(f"{how}: USD {in_batches:,.2f}"))
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
-        print(f"price unknown, not in the sum: {unknown}")
+        print(wrapped(f"price unknown, not in the sum: {unknown}"))
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
@@ -71,7 +72,7 @@ class PrintedProgress(Progress):
 
     def note(self, text: str) -> None:
         """See `Progress`."""
-        self.write(f"! {text}")
+        self.write(f"! {plain(text)}")
 
     def tell(self, text: str) -> None:
         """Print a result that a person waits for."""
@@ -82,11 +83,12 @@ class PrintedProgress(Progress):
         if self.current_stage is not None:
             self.write(self.line())
 
-    def write(self, line: str) -> None:
-        """Print a line, which may hold a provider's words. A stream that is gone ends the run as SIGTERM would."""
+    def write(self, text: str) -> None:
+        """Print text, which may hold a provider's words. A stream that is gone ends the run as SIGTERM would."""
         try:
             with self._printing:
-                self.print_line(plain(line))
+                for each in text.split("\n"):
+                    self.print_line(plain(each))
         except OSError:
             if self._is_gone:
                 return
@@ -144,6 +146,7 @@ class LiveProgress(PrintedProgress):
         from rich.live import Live
 
         super().__init__(stream)
+        self._idle, self._idle_since = "starting", time.monotonic()
         self._console = Console(file=stream, highlight=False, markup=False, emoji=False)
         self._live = Live(
             console=self._console,
@@ -155,8 +158,13 @@ class LiveProgress(PrintedProgress):
 
     def start(self) -> None:
         """See `PrintedProgress`."""
-        self._live.start()
+        self._live.start(refresh=True)
         super().start()
+
+    def end_stage(self) -> None:
+        """See `Progress`."""
+        super().end_stage()
+        self._idle, self._idle_since = "looking for what is left to make", time.monotonic()
 
     def close(self) -> None:
         """See `Progress`."""
@@ -180,7 +188,7 @@ class LiveProgress(PrintedProgress):
         from rich.text import Text
 
         if (now := self.current_stage) is None:
-            return Group()
+            return Group(Text(f"{self._idle}  {clock(time.monotonic() - self._idle_since)}", style="dim"))
         lines: list[Any] = [Text(self._heading(now), style="bold", no_wrap=True, overflow="ellipsis")]
         if now.detail:
             lines.append(Text(plain(f"  {now.detail}"), no_wrap=True, overflow="ellipsis"))

@@ -86,11 +86,11 @@ def release(arguments: argparse.Namespace) -> int:
         date=_date(arguments.date),
         commitment=arguments.commitment,
     )
-    written = write_release(content_of(workspace, arguments.arms), target, options)
-    rows = ", ".join(f"{count} {table}" for table, count in written.rows.items())
-    print(f"{written.files} files in {target}: {written.clips} clips; {rows}")
-    if written.answers:
-        print(f"which item is which, for you alone: {written.answers}")
+    output = write_release(content_of(workspace, arguments.arms), target, options)
+    rows = ", ".join(f"{count} {table}" for table, count in output.rows.items())
+    print(f"{output.files} files in {target}: {output.clips} clips; {rows}")
+    if output.answers:
+        print(f"which item is which, for you alone: {output.answers}")
     if arguments.sign:
         print(f"signature: {sign(target, arguments.sign)}")
     print(f"next: read {target / CARD}; traps publish verify {target}")
@@ -138,17 +138,17 @@ def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
     from traps_pipeline.release.submission import read_submission
     from traps_pipeline.release.verification import verify
 
-    found = verify(read_submission(path), release)
+    verified = verify(read_submission(path), release)
     if is_json:
-        print_json({"problems": found.problems, "checked": found.checked, "not_checked": found.unchecked})
-        return FAILED if found.problems else OK
-    for problem in found.problems:
+        print_json({"problems": verified.problems, "checked": verified.checked, "not_checked": verified.unchecked})
+        return FAILED if verified.problems else OK
+    for problem in verified.problems:
         print(plain(problem))
-    print(f"checked: {', '.join(found.checked)}")
-    for what in found.unchecked:
+    print(f"checked: {', '.join(verified.checked)}")
+    for what in verified.unchecked:
         print(f"not checked: {what}")
-    print(f"{path}: {'does not hold' if found.problems else 'holds'}")
-    return FAILED if found.problems else OK
+    print(f"{path}: {'does not hold' if verified.problems else 'holds'}")
+    return FAILED if verified.problems else OK
 
 
 def harness(arguments: argparse.Namespace) -> int:
@@ -180,8 +180,8 @@ def results(arguments: argparse.Namespace) -> int:
     from traps_pipeline.release.results import Who, write_results
 
     target, who = arguments.folder.absolute(), Who(arguments.organization, arguments.developer)
-    written = write_results(open_workspace(arguments), target, arguments.dataset, who)
-    print(f"{len(written)} files in {target}")
+    files = write_results(open_workspace(arguments), target, arguments.dataset, who)
+    print(f"{len(files)} files in {target}")
     return OK
 
 
@@ -190,8 +190,8 @@ def leaderboard(arguments: argparse.Namespace) -> int:
     from traps_pipeline.release.submissions import PAGE, gather, write_board
     from traps_pipeline.report.leaderboard_page import leaderboard_text
 
-    given = arguments.submissions
-    paths = [path for one in given for path in (sorted(one.glob("*.zip")) if one.is_dir() else [one])]
+    submissions = arguments.submissions
+    paths = [path for one in submissions for path in (sorted(one.glob("*.zip")) if one.is_dir() else [one])]
     board = gather(paths, arguments.release, say=lambda line: print(plain(line), file=sys.stderr, flush=True))
     write_board(board, arguments.out.absolute())
     if arguments.json:

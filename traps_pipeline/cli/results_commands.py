@@ -39,14 +39,14 @@ def site(arguments: argparse.Namespace) -> int:
 
     workspace = open_workspace(arguments)
     folder = (arguments.folder or workspace.root / "site").absolute()
-    written = write_site(workspace, folder, clips=not arguments.without_clips)
-    clips = f"{written.clips} clips, {_megabytes(written.clip_bytes)}"
+    summary = write_site(workspace, folder, clips=not arguments.without_clips)
+    clips = f"{summary.clips} clips, {_megabytes(summary.clip_bytes)}"
     print(
-        f"{written.answers} answers with {written.votes} votes: {written.files} files, {_megabytes(written.bytes)}; "
+        f"{summary.answers} answers with {summary.votes} votes: {summary.files} files, {_megabytes(summary.bytes)}; "
         + ("without clips" if arguments.without_clips else clips)
     )
-    if written.lacking:
-        print(f"{len(written.lacking)} clips are not in the study, the first is {written.lacking[0]}")
+    if summary.lacking:
+        print(f"{len(summary.lacking)} clips are not in the study, the first is {summary.lacking[0]}")
     print(f"next: open {folder / INDEX}")
     return OK
 
@@ -99,8 +99,8 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     words = {True: "yes", False: "no"}
     separable = [words.get(value, "too few") for value in table["separable"]]
     separable = ["-" if p != p else word for word, p in zip(separable, table["p"], strict=True)]
-    shown = table.assign(separable=separable, refused=table["refused"].fillna(""))
-    print(text_table(list(shown), [[_cell(value) for value in row] for row in shown.itertuples(index=False)]))
+    contrasts = table.assign(separable=separable, refused=table["refused"].fillna(""))
+    print(text_table(list(contrasts), [[_cell(value) for value in row] for row in contrasts.itertuples(index=False)]))
     return OK
 
 

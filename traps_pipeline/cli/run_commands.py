@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import plain, wrapped
+from traps_pipeline.base.terminal import wrapped
 from traps_pipeline.cli.command import (
     FAILED,
     OK,
@@ -22,6 +22,7 @@ from traps_pipeline.cli.command import (
     experiment_of,
     load_definitions,
     number,
+    print_failure,
     print_json,
     whole,
 )
@@ -100,17 +101,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
-    load_definitions()
-    from traps_pipeline.pipeline.experiment_run import run_experiment
-
     about = sys.stderr if arguments.json else sys.stdout
-    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", file=about, flush=True)
-    with reporting(make_progress(arguments.progress)) as shown:
+    title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
+    print(f"{wrapped(title, about)}\nworkspace {workspace.place}", file=about, flush=True)
+    with reporting(make_progress(arguments.progress)) as progress:
+        load_definitions()  # takes seconds, as Dagster's import does
+        from traps_pipeline.pipeline.experiment_run import run_experiment
+
         report = run_experiment(
             workspace,
             experiment,
             until=arguments.until,
-            preflight=None if arguments.no_preflight else shown.tell,
+            preflight=None if arguments.no_preflight else progress.tell,
             look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
             open_runs=partial(_open_runs, arguments),
         )
@@ -162,18 +164,17 @@ def _print_problems(problems: Sequence[str]) -> None:
     for problem in problems:
         alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
     for first, *more in alike.values():
-        print(f"traps: {plain(first)}{f' (and {len(more)} more)' if more else ''}", file=sys.stderr)
-    print(
-        f"traps: {len(problems)} problem(s); finished work is kept: run the same command to continue", file=sys.stderr
-    )
+        print_failure(f"{first}{f' (and {len(more)} more)' if more else ''}")
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    print_failure(f"{count}; finished work is kept: run the same command to continue")
     cause, most = max(alike.items(), key=lambda pair: len(pair[1]))
     if len(most) > 1:
-        print(f"traps: {len(most)} of them have one cause: {plain(cause)}", file=sys.stderr)
+        print_failure(f"{len(most)} of them have one cause: {cause}")
 
 
 @contextmanager
 def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
-    """Who makes the runs: this process, or the hosts of a cluster. Raises TrapsError where there is none."""
+    """Open what makes the runs: this process, or the hosts of a cluster. Raises TrapsError where there is none."""
     from traps_pipeline.definitions import defs
     from traps_pipeline.pipeline.runs import RunsHere
 
@@ -227,5 +228,5 @@ def _print_results(workspace: Workspace) -> None:
     if board.empty:
         print("no leaderboard: no pairs were asked; the report has the tables of what was")
         return
-    said = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
-    print(leaderboard_text(board, workspace.tables.read_all(ROBUST), said))
+    notes = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    print(leaderboard_text(board, workspace.tables.read_all(ROBUST), notes))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.terminal import plain, text_table
+from traps_pipeline.base.terminal import plain, text_table, wrapped
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -57,7 +57,7 @@ def status(arguments: argparse.Namespace) -> int:
         return OK
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
-        print(plain(f"check {check} of {stage} {partition} does not pass: {reason}"))
+        print(wrapped(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
     total, behind = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
     if not behind:
         print(f"all {total:,} partitions of {len(rows)} stages are fresh")
@@ -70,7 +70,7 @@ def status(arguments: argparse.Namespace) -> int:
         for reason, keys in row.by_reason().items():
             more = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
             which = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
-            print(plain(f"    {which}{reason[:MOST_REASON]}"))
+            print(wrapped(plain(f"    {which}{reason[:MOST_REASON]}")))
     count = sum(len(row.stale) + len(row.missing) for row in behind)
     print(f"{count:,} of {total + count:,} partitions are not fresh; `{command}` makes them")
     return OK
@@ -94,5 +94,5 @@ def why(arguments: argparse.Namespace) -> int:
         print_json(explanation)
         return OK
     for line in lines_of(explanation):
-        print(plain(line))
+        print(wrapped(plain(line)))
     return OK

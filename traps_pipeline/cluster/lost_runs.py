@@ -52,7 +52,7 @@ def _why_lost(instance: dg.DagsterInstance, run: dg.DagsterRun, *, is_old: bool)
     "before they began; those that wait for a host go on waiting. Fetches what runs print from the study's store.",
 )
 def end_lost_runs(context: dg.SensorEvaluationContext) -> dg.SkipReason:
-    """For studies whose runs go to a cluster."""
+    """Mark runs as failed that a cluster has lost."""
     workspace = Workspace.open()
     try:
         failed = fail_lost_runs(context.instance)

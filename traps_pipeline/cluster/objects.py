@@ -142,8 +142,8 @@ class ObjectStore(Store):
 
     def keep(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
-        kept = {*paths}
-        known, removals = self._known(kept), self.names.removals
+        names = {*paths}
+        known, removals = self._known(names), self.names.removals
 
         def one(path: Path) -> tuple[Path, Current] | None:
             row = known.get(path)
@@ -155,7 +155,7 @@ class ObjectStore(Store):
             self._verified.add(digest)
             return None if row is not None and row.digest == digest else (path, Current(digest, len(content)))
 
-        self._change(dict(pair for pair in _side_by_side(one, kept) if pair is not None), removals)
+        self._change(dict(pair for pair in _side_by_side(one, names) if pair is not None), removals)
 
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
         """See `Store`."""

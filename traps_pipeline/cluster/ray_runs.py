@@ -211,26 +211,26 @@ class RayRuns(Runs):
                 if event.is_step_failure:
                     self._failures.setdefault(run_id, []).append(event)
                     continue
-                written = event.step_materialization_data.materialization
-                if TALLY in written.metadata:
-                    tally = progress.Tally(**json.loads(str(written.metadata[TALLY].value)))
-                    if TAKEN in written.metadata:
-                        progress.current().helped(written.asset_key.path[-1], tally)
+                stored = event.step_materialization_data.materialization
+                if TALLY in stored.metadata:
+                    tally = progress.Tally(**json.loads(str(stored.metadata[TALLY].value)))
+                    if TAKEN in stored.metadata:
+                        progress.current().helped(stored.asset_key.path[-1], tally)
                     else:
-                        progress.current().partition(written.asset_key.path[-1], written.partition or "", tally)
+                        progress.current().partition(stored.asset_key.path[-1], stored.partition or "", tally)
 
     def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> Ran:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
             return Ran([f"{name} is in Dagster's history no more"], over_budget=False)
-        ran = problems_of([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
-        if run.status != dg.DagsterRunStatus.SUCCESS and not ran.problems:
+        outcome = problems_of([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
+        if run.status != dg.DagsterRunStatus.SUCCESS and not outcome.problems:
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.
             why = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
             ended = f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`"
-            ran.problems.append(message if REFUSED_TAG in run.tags else ended)
-        return ran
+            outcome.problems.append(message if REFUSED_TAG in run.tags else ended)
+        return outcome
 
     def _last_message(self, run_id: str) -> str:
         """Return why a run ended whose steps do not say it: an error of its launcher, or its last event's message."""

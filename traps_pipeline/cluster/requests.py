@@ -53,7 +53,10 @@ def _run_request(record: dg.EventLogRecord) -> dg.RunRequest:
     description="Puts the runs into the queue that `traps run --cluster` asks for.",
 )
 def start_requested_runs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
-    """For studies whose runs go to a cluster. The cursor has a place for each study: they may share a history."""
+    """Start the runs that a command asked a cluster for.
+
+    The cursor has a place for each study: they may share a history.
+    """
     study, cursors = _study_here(), json.loads(context.cursor or "{}")
     result = context.instance.fetch_observations(_key(study), AT_ONCE, cursors.get(study), ascending=True)
     cursors[study] = result.cursor

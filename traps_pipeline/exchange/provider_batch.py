@@ -164,7 +164,7 @@ def is_batch(path: Path) -> bool:
 def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]:
     """Return what a file of OpenAI's, vLLM's, Gemini's or Anthropic's form returns, by key. Raises TrapsError naming
     lines that are no answers, and keys that are not wanted or stand there twice."""
-    found, wrong = dict[str, Returned](), list[str]()
+    answers, wrong = dict[str, Returned](), list[str]()
     for number, line in read_lines(path):
         try:
             key, returned = _returned(json.loads(line))
@@ -175,12 +175,12 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]
             continue
         if key not in wanted:
             wrong.append(f"{path}:{number}: key {plain(key)[:16]} is not wanted: question, clip or setting changed")
-        elif found.setdefault(key, returned) != returned:
+        elif answers.setdefault(key, returned) != returned:
             wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
     if wrong:
         more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
-    return found
+    return answers
 
 
 def _returned(line: Any) -> tuple[str, Returned]:

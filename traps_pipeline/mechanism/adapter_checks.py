@@ -52,8 +52,8 @@ class Subject:
     @cached_property
     def direction(self) -> np.ndarray:
         """A random unit vector as wide as the states, (d,) float32."""
-        drawn = np.random.default_rng(0).normal(size=self.model.d_model)
-        return (drawn / np.linalg.norm(drawn)).astype(np.float32)
+        vector = np.random.default_rng(0).normal(size=self.model.d_model)
+        return (vector / np.linalg.norm(vector)).astype(np.float32)
 
     @property
     def layer(self) -> int:
@@ -189,7 +189,7 @@ def _patching(subject: Subject) -> str:
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(what for what, there in beside.items() if there)
+    also = ", ".join(what for what, differs in beside.items() if differs)
     return "exactly 0, and 1" + (f" with {also}" if also else "")
 
 

@@ -194,13 +194,13 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     items, width = run.items, int(run.items["width"].iloc[0])
     prompts, place = np.unique(items["states_key"].to_numpy(str), return_inverse=True)
     of = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
-    drawn: dict[tuple[str, ...], list[Row]] = {}
+    groups: dict[tuple[str, ...], list[Row]] = {}
     for draw in range(draws):
         vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
         for row in scored(run, {name: vectors[rows] for name, rows in of.items()}):
-            drawn.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
+            groups.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
     rows = []
-    for same in drawn.values():
+    for same in groups.values():
         values = np.array([row["value"] for row in same], float)
         if np.isnan(values).any():  # a figure that cannot be computed of these items, whatever their features are
             continue

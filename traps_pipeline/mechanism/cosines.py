@@ -117,18 +117,18 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
 
 
 def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> dict[str, float]:
-    drawn = disattenuated(one, other, weights)
+    values = disattenuated(one, other, weights)
     low, high = (np.nan, np.nan)
-    if np.isfinite(drawn[1:]).mean() > 0.5:
-        low, high = np.nanquantile(drawn[1:], [0.025, 0.975])
-    return {"disattenuated": float(drawn[0]), "low": float(low), "high": float(high)}
+    if np.isfinite(values[1:]).mean() > 0.5:
+        low, high = np.nanquantile(values[1:], [0.025, 0.975])
+    return {"disattenuated": float(values[0]), "low": float(low), "high": float(high)}
 
 
 def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
     """Return how often each scenario counts, (1 + RESAMPLES, scenarios): first once, then resampled within its
     taxonomy."""
-    drawn, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
+    weights, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
         if n := int(np.count_nonzero(of == taxonomy)):
-            drawn[1:, of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
-    return drawn
+            weights[1:, of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
+    return weights

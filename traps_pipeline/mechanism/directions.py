@@ -118,8 +118,8 @@ def extract_directions(
     vectors = {VOID: unit[None]}
     for number, kind in enumerate(NULLS):
         if kind in nulls:
-            drawn = _null_draws(kind, void, control, np.random.default_rng([*seed, number]), draws)
-            vectors[kind] = _orthogonal(drawn, unit)
+            null_vectors = _null_draws(kind, void, control, np.random.default_rng([*seed, number]), draws)
+            vectors[kind] = _orthogonal(null_vectors, unit)
     directions = {kind: of.astype(np.float32) for kind, of in vectors.items()}
     return Directions(directions, gaps, np.linalg.norm(control, axis=2).mean(axis=1))
 
@@ -136,15 +136,15 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
     return np.einsum("kn,lnd->kld", rng.standard_normal((draws, 2 * pairs)), np.concatenate(centred, axis=1))
 
 
-def _orthogonal(drawn: np.ndarray, unit: np.ndarray) -> np.ndarray:
+def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """Return the unit vectors of what is left of draws (draws, layers, d) without their part along `unit` (layers, d);
     zero where hardly anything is left, and where `unit` itself is zero."""
-    remainder = drawn - (drawn * unit).sum(axis=2, keepdims=True) * unit
+    remainder = vectors - (vectors * unit).sum(axis=2, keepdims=True) * unit
     remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
-    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (drawn, remainder))
+    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (vectors, remainder))
     differs = np.abs(unit).max(axis=1) > 0
-    kept = (after > _NOTHING_LEFT * before) & differs[None, :, None]
-    return np.where(kept, remainder / np.where(kept, after, 1), 0.0)
+    mask = (after > _NOTHING_LEFT * before) & differs[None, :, None]
+    return np.where(mask, remainder / np.where(mask, after, 1), 0.0)
 
 
 def vector_digest(vector: np.ndarray) -> str:

@@ -7,7 +7,7 @@ target, kind, layer, alpha, side, abstention (a fraction).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.transfer_paths import FAMILIES, PATH_SETS
@@ -44,7 +44,8 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
     parts: list[pd.DataFrame] = []
     for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *BESIDE))]:
         if value in rows:
-            wide = rows.pivot_table(index=keys, columns="side", values=value, dropna=False, observed=True)
+            means = rows.groupby([*keys, "side"], observed=True, dropna=False)[[value]].mean()
+            wide = cast("pd.DataFrame", means.unstack("side")[value])
             parts.append(wide.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
             columns += [f"control{suffix}", f"void{suffix}"]
     wide = parts[0].join(parts[1:]).reset_index().reindex(columns=pd.Index(columns))

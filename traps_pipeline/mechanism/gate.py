@@ -75,11 +75,11 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
     return {MID: float(mid), J: float(cuts[int(np.argmax(gained))]), CONFORMAL: conformal}
 
 
-def sources_of_gate(source: str, target: str, there: Sequence[str] = DATASETS) -> list[str]:
+def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS) -> list[str]:
     """Return the datasets that a gate of SOURCES is fitted on for a target, of those that a study has."""
     if source == OTHER_DATASETS:
-        return [name for name in there if name != target]
-    return [name for name in there if source in (OTHER_FAMILIES, f"one:{name}")]
+        return [name for name in datasets if name != target]
+    return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
 
 
 def decide(
@@ -101,9 +101,9 @@ def decide(
     score = np.full(len(scored), np.nan)
     cut = {name: np.full(len(scored), NEVER) for name in THRESHOLDS}
     expected = {name: np.zeros(len(scored)) for name in THRESHOLDS}
-    for held in _held_groups(groups[scored], source, folds, seed):
-        here = np.isin(groups[scored], held)
-        train = items.rows(inside & ~np.isin(groups, held))
+    for fold in _held_groups(groups[scored], source, folds, seed):
+        here = np.isin(groups[scored], fold)
+        train = items.rows(inside & ~np.isin(groups, fold))
         if len(set(train.void)) < 2:
             continue
         probe, cuts, shares = fit_gate(train, folds, seed, false_abs, solver)
@@ -172,9 +172,9 @@ class Outcomes:
         parts |= {"abs_rec": (self.void, self.abstained)}
         shares: dict[str, np.ndarray] = {}
         for name, (side, values) in parts.items():
-            kept = side & np.isfinite(values)
+            mask = side & np.isfinite(values)
             with np.errstate(invalid="ignore", divide="ignore"):
-                shares[name] = (weight[:, kept] @ values[kept]) / weight[:, kept].sum(axis=1)
+                shares[name] = (weight[:, mask] @ values[mask]) / weight[:, mask].sum(axis=1)
         shares["pecs"] = shares["acc"] * np.maximum(0, shares["abs_rec"] - shares["false_abs"])
         return shares
 
@@ -182,7 +182,7 @@ class Outcomes:
         """Return how often each item is yes and is decided for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""
         parts = ((~self.void, self.correct), (~self.void, self.abstained), (self.void, self.abstained))
         decided = [side & np.isfinite(values) for side, values in parts]
-        yes = [np.where(made, values, 0.0) for made, (_, values) in zip(decided, parts, strict=True)]
+        yes = [np.where(decision, values, 0.0) for decision, (_, values) in zip(decided, parts, strict=True)]
         return np.stack([column for pair in zip(yes, decided, strict=True) for column in pair], axis=-1).astype(float)
 
 
@@ -199,9 +199,9 @@ def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[flo
     order = np.flatnonzero(known)[np.argsort(score[known], kind="stable")]
     points = []
     for coverage in coverages:
-        kept = round(coverage * len(score))
-        if 0 < kept <= len(order):
-            points.append((kept / len(score), float(wrong[order[:kept]].mean()), kept))
+        count = round(coverage * len(score))
+        if 0 < count <= len(order):
+            points.append((count / len(score), float(wrong[order[:count]].mean()), count))
     return points
 
 

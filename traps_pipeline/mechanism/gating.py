@@ -73,8 +73,8 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
     resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
     return [
         row
-        for regime, outcomes, gates, source, made in _each(workspace, entry, states, SOURCES)
-        for row in _rows(states, (gates, regime, source), made, outcomes, resamples, seed)
+        for regime, outcomes, gates, source, decided in _each(workspace, entry, states, SOURCES)
+        for row in _rows(states, (gates, regime, source), decided, outcomes, resamples, seed)
     ]
 
 
@@ -82,8 +82,8 @@ def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) ->
     """Return rows of RISK_COVERAGE of an extraction: gates from other datasets, and as `gate_rows` else."""
     return [
         row
-        for regime, outcomes, gates, _, made in _each(workspace, entry, states, (OTHER_DATASETS,))
-        for row in _curves(states, gates, regime, made, outcomes)
+        for regime, outcomes, gates, _, decided in _each(workspace, entry, states, (OTHER_DATASETS,))
+        for row in _curves(states, gates, regime, decided, outcomes)
     ]
 
 
@@ -95,7 +95,7 @@ def _each(
 ) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, Made]]:
     """Yield regime, its outcomes, features, source and decisions of every gate."""
     outcomes = {
-        regime: found for regime in PROMPTING if (found := outcomes_of(workspace, entry.id, regime, states)) is not None
+        regime: known for regime in PROMPTING if (known := outcomes_of(workspace, entry.id, regime, states)) is not None
     }
     if not outcomes:
         raise TrapsError(
@@ -207,7 +207,7 @@ def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredSta
 def _rows(
     states: StoredStates,
     about: tuple[str, str, str],
-    made: Made,
+    decided: Made,
     outcomes: Mapping[str, Outcomes],
     resamples: int,
     seed: int,
@@ -218,7 +218,7 @@ def _rows(
     for threshold in THRESHOLDS:
         of_datasets: list[dict[str, float]] = []
         draws: list[np.ndarray] = []
-        for target, (decisions, layer) in made.items():
+        for target, (decisions, layer) in decided.items():
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
             gated = outcome.gated(gate)
@@ -241,10 +241,10 @@ def _rows(
         if len(of_datasets) == len(DATASETS):
             means = {name: float(np.mean([one[name] for one in of_datasets])) for name in of_datasets[0]}
             sides = [
-                sum(getattr(r, name) for r in rows[-len(made) :] if r.target in DATASETS)
+                sum(getattr(r, name) for r in rows[-len(decided) :] if r.target in DATASETS)
                 for name in ("n_controls", "n_voids")
             ]
-            layers = {layer for target, (_, layer) in made.items() if target in DATASETS}
+            layers = {layer for target, (_, layer) in decided.items() if target in DATASETS}
             layer = layers.pop() if len(layers) == 1 else -1
             about_pecs = interval(np.mean(draws, axis=0), means["pecs"], (0.0, 1.0))
             rows.append(_row(states, (*about, threshold, ALL), layer, np.nan, means, about_pecs, (sides[0], sides[1])))
@@ -255,13 +255,13 @@ def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples
     """Return resampled sums of a dataset's outcomes with an unseen scenario, (9, 1 + resamples). The datasets of a
     taxonomy share their resamples, and taxonomies do not. scenarios: (n,), of each item."""
     taxonomy = probed_taxonomy(target)
-    drawn = draw_scenarios(pd.DataFrame({"scenario_id": scenarios, "taxonomy": taxonomy}), resamples, seed)
-    ids, weights = drawn.scenarios[taxonomy]
+    resampling = draw_scenarios(pd.DataFrame({"scenario_id": scenarios, "taxonomy": taxonomy}), resamples, seed)
+    ids, weights = resampling.scenarios[taxonomy]
     counts = np.zeros((len(ids), 6))
     np.add.at(counts, ids.get_indexer(pd.Index(scenarios)), outcomes.counts())
     having = (counts[:, 1::2] > 0).sum(axis=0)
     sums = resampled_sums(weights, counts[:, None])[0]
-    return with_unseen(sums, having, drawn.unseen(f"gate|{target}", decisions=3))
+    return with_unseen(sums, having, resampling.unseen(f"gate|{target}", decisions=3))
 
 
 def _row(
@@ -290,15 +290,15 @@ def _curves(
     states: StoredStates,
     features: str,
     regime: str,
-    made: Made,
+    decided: Made,
     outcomes: Mapping[str, Outcomes],
 ) -> list[RiskCoverageRow]:
     """Return risk against coverage over the four datasets together; a score counts from its own gate's mid threshold,
     so that the scores of four gates are comparable."""
-    own = [name for name in made if name in DATASETS]
+    own = [name for name in decided if name in DATASETS]
     if not own:
         return []
-    score = np.concatenate([made[name][0].score - made[name][0].threshold[MID] for name in own])
+    score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in own])
     parts = [outcomes[name] for name in own]
     pooled = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
     points = [(features, *point) for point in risk_coverage(score, pooled, COVERAGES)]

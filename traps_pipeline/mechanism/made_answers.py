@@ -77,8 +77,8 @@ class MadeAnswers:
             if missing:
                 outcomes = make(missing, lambda: False)
                 stored |= zip([each.key for each in missing], outcomes, strict=True)
-                written = json.dumps({key: asdict(each) for key, each in stored.items()})
-                self._store.write({self._path(chunk): written.encode()})
+                content = json.dumps({key: asdict(each) for key, each in stored.items()})
+                self._store.write({self._path(chunk): content.encode()})
             return len(missing)
 
     def forget(self, requests: Sequence[Request]) -> None:
@@ -121,7 +121,7 @@ def is_written(ledger: Ledger, evaluation: str) -> bool:
 
 
 def make_meanwhile(
-    made: MadeAnswers,
+    shared: MadeAnswers,
     ledger: Ledger,
     evaluation: str,
     wanted: Sequence[Request],
@@ -130,9 +130,9 @@ def make_meanwhile(
 ) -> int:
     """Make answers to these calls from their end, for as long as another process writes their evaluation; returns how
     many were made. tick: gets the chunks done and their number."""
-    chunks, count = made.chunks(wanted), 0
+    chunks, count = shared.chunks(wanted), 0
     for done, chunk in enumerate(reversed(chunks), start=1):
-        count += made.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
+        count += shared.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
         tick(done, len(chunks))
         if not is_written(ledger, evaluation):
             break

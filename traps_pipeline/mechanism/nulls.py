@@ -27,9 +27,9 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
     there are no rows."""
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     moved = _moved(own)
-    drawn = moved.loc[moved["kind"].isin(NULLS)]
+    nulls = moved.loc[moved["kind"].isin(NULLS)]
     rows: list[SteeringNullRow] = []
-    for target in [*sorted(set(drawn["target"])), ALL]:
+    for target in [*sorted(set(nulls["target"])), ALL]:
         part = moved if target == ALL else moved.loc[moved["target"] == target]
         rows += _ranked(part, target)
     return rows

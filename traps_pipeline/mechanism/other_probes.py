@@ -61,10 +61,10 @@ class Eraser:
         states = np.asarray(states, float)
         mean, label = states.mean(axis=0), void - np.mean(void)
         left, size, right = np.linalg.svd(states - mean, full_matrices=False)
-        kept = size > size[0] * max(states.shape) * np.finfo(float).eps
-        towards = left[:, kept].T @ label  # rows of `left` have unit covariance up to a factor
+        mask = size > size[0] * max(states.shape) * np.finfo(float).eps
+        towards = left[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
         towards /= np.linalg.norm(towards)
-        return Eraser(mean, (towards / size[kept]) @ right[kept], (towards * size[kept]) @ right[kept])
+        return Eraser(mean, (towards / size[mask]) @ right[mask], (towards * size[mask]) @ right[mask])
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """Return states (m, d) without the concept."""

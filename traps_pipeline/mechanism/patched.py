@@ -120,15 +120,15 @@ class Pairs:
     def changes(self) -> tuple[list[Row], list[Row]]:
         """Return what every patch from the other side does by estimate, and what the patches of `best_cells` and their
         nulls do: a row for each pair, direction, source and cell."""
-        kept = set[Path]()
-        estimates = self._each("estimates", self._estimates, kept)
+        paths = set[Path]()
+        estimates = self._each("estimates", self._estimates, paths)
         best = best_cells(estimates, self._settings, self._model.n_layers)
-        patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), kept)
+        patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
         store = self._workspace.store
-        store.remove({*store.below(self._folder)} - kept)  # of other settings or items
+        store.remove({*store.below(self._folder)} - paths)  # of other settings or items
         return estimates, patches
 
-    def _each(self, kind: str, make: Callable[[str], Iterable[Row]], kept: set[Path]) -> list[Row]:
+    def _each(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:
         """Return the rows of all pairs: read where a file holds them, else made and written."""
         rows, store = list[Row](), self._workspace.store
         for number, name in enumerate(self._names, start=1):
@@ -139,7 +139,7 @@ class Pairs:
                 of_pair = [*make(name)]
                 store.write({path: json.dumps(of_pair).encode()})
             rows += of_pair
-            kept.add(path)
+            paths.add(path)
             progress.current().tick("patching", f"pairs of {self._dataset}, {kind}", number, len(self._names))
         return rows
 
@@ -292,11 +292,11 @@ def summed(
     for key in sorted({*estimated, *patched, *nothing}):
         into, source, site, layer, group = key
         rows = patched.get(key) or estimated.get(key) or []
-        before, there, change = (np.array([row[name] for row in rows]) for name in ("before", "there", "change"))
-        gap = float((there - before).sum()) if len(rows) else 0.0
+        before, target, change = (np.array([row[name] for row in rows]) for name in ("before", "there", "change"))
+        gap = float((target - before).sum()) if len(rows) else 0.0
         attributed = sum(row["change"] for row in estimated.get(key, ()))
-        effect = effect_of(before, before + change, there, seed) if key in patched else (None, None, None)
-        differs = np.sign(before) != np.sign(there)
+        effect = effect_of(before, before + change, target, seed) if key in patched else (None, None, None)
+        differs = np.sign(before) != np.sign(target)
         flipped = (np.sign(before + change) != np.sign(before)) & differs
         yield PatchingRow(
             **extraction.partition,
@@ -319,7 +319,7 @@ def summed(
 
 
 def effect_of(
-    before: np.ndarray, after: np.ndarray, there: np.ndarray, seed: int
+    before: np.ndarray, after: np.ndarray, target: np.ndarray, seed: int
 ) -> tuple[float | None, float | None, float | None]:
     """Return the indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each).
 
@@ -327,13 +327,13 @@ def effect_of(
     sides hardly differ is noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's
     width. None where the sides do not differ at all.
     """
-    moved, apart = after - before, there - before
+    moved, apart = after - before, target - before
     if not apart.sum():
         return None, None, None
     effect = float(moved.sum() / apart.sum())
     pairs = pd.DataFrame({"scenario_id": np.arange(len(moved)), "taxonomy": TAXONOMIES[0]})
-    drawn = draw_scenarios(pairs, RESAMPLES, seed)
-    sums = drawn.scenarios[TAXONOMIES[0]][1] @ np.stack([moved, apart], axis=-1)
-    ends = shares_of(with_unseen(sums.T, np.array([len(moved)]), drawn.unseen("effect", decisions=1)))
+    resampling = draw_scenarios(pairs, RESAMPLES, seed)
+    sums = resampling.scenarios[TAXONOMIES[0]][1] @ np.stack([moved, apart], axis=-1)
+    ends = shares_of(with_unseen(sums.T, np.array([len(moved)]), resampling.unseen("effect", decisions=1)))
     low, high = interval(ends[:, 0, 1:], effect, (-np.inf, np.inf))
     return effect, float(low), float(high)

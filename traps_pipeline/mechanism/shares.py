@@ -145,17 +145,17 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
     """
     ends = np.empty((2, n_paths, 1 + resamples))
     numbered = numbered.assign(taxonomy=numbered["dataset"].map(taxonomy_of))
-    drawn = draw_scenarios(numbered, resamples, seed)
+    resampling = draw_scenarios(numbered, resamples, seed)
     for taxonomy in TAXONOMIES:
         of_taxonomy = numbered.loc[numbered["taxonomy"] == taxonomy]
-        names, weights = drawn.scenarios[taxonomy]
+        names, weights = resampling.scenarios[taxonomy]
         path, chosen = pd.factorize(of_taxonomy["path"])
         counts = np.zeros((len(names), len(chosen), 2))
         places = names.get_indexer(pd.Index(of_taxonomy["scenario_id"])), path
         np.add.at(counts[..., 0], places, of_taxonomy["abstained"].to_numpy(bool))
         np.add.at(counts[..., 1], places, 1)
         sums = with_unseen(
-            resampled_sums(weights, counts), (counts[..., 1:] > 0).sum(axis=0), drawn.unseen(taxonomy, decisions=1)
+            resampled_sums(weights, counts), (counts[..., 1:] > 0).sum(axis=0), resampling.unseen(taxonomy, decisions=1)
         )
         ends[:, chosen] = shares_of(sums)[:, :, 0]
     return ends

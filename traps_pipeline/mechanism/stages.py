@@ -83,12 +83,12 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     asked_of = [
         probed_item(workspace, model, entry.media, {str(k): v for k, v in item.items()}, system) for item in items
     ]
-    held = workspace.store.below(folder)
-    workspace.store.bring(held)
+    existing = workspace.store.below(folder)
+    workspace.store.bring(existing)
     done = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     workspace.store.keep(files)
-    workspace.store.remove({*held} - {*files})
+    workspace.store.remove({*existing} - {*files})
     record, (ids, _) = read_record(folder), read_layer(folder, 0)
     keys, devices = (dict(zip(ids["item_id"], ids[name], strict=True)) for name in ("key", "device"))
     source = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
@@ -157,7 +157,7 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
     made_of = digest(
         [
             states.digest,
-            {name: sorted(found) for name, found in confabulated.scenarios.items()},
+            {name: sorted(scenarios) for name, scenarios in confabulated.scenarios.items()},
             dict(confabulated.problems),
             [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed, CURVES],
         ]

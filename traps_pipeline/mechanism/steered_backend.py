@@ -29,9 +29,9 @@ class SteeredBackend(LocalBackend):
     """A local model that answers with a direction added to one block, each row with a direction and an alpha of its
     own."""
 
-    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], made: MadeAnswers) -> None:
+    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: MadeAnswers) -> None:
         super().__init__(entry)
-        self._vectors, self._made = vectors, made
+        self._vectors, self._made = vectors, shared
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:

@@ -125,8 +125,8 @@ def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[D
     """Return the doses of a direction without those in class gaps that are longer than `cap` control states; of a null
     the largest one."""
     longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
-    kept = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
-    return kept if row.kind == "void" else kept[-1:]
+    doses = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
+    return doses if row.kind == "void" else doses[-1:]
 
 
 class _Planned(NamedTuple):
@@ -299,7 +299,7 @@ def _make_meanwhile(
     workspace: Workspace,
     cell: SteeringCell,
     questions: Sequence[SteeredQuestion],
-    made: MadeAnswers,
+    shared: MadeAnswers,
     backend: SteeredBackend,
 ) -> None:
     """Make answers of a cell while another process writes those of its evaluation."""
@@ -307,7 +307,7 @@ def _make_meanwhile(
     report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
     requests = [each.request for each in questions]
     tick = partial(report.tick, "steering", f"chunks of answers of {cell.key}")
-    count = make_meanwhile(made, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
+    count = make_meanwhile(shared, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
     report.note(f"{cell.key}: {count} answers were made for the process that writes them")
 
 

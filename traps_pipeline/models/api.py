@@ -73,6 +73,7 @@ def load_litellm() -> Any:
     os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"
     litellm: Any = import_module("litellm")
     warnings.filterwarnings("ignore", "Pydantic serializer warnings")  # of odd answers, which become outcomes here
+    warnings.filterwarnings("ignore", "coroutine 'OpenAIChatCompletion")  # of calls given up before they began
     logging.getLogger("LiteLLM").setLevel(logging.ERROR)  # it warns at every call of Gemini 3 that has a temperature
     litellm.telemetry = False
     litellm.suppress_debug_info = True

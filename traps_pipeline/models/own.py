@@ -169,8 +169,8 @@ def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
 def _params(protocol: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     """Return what is sent: the protocol's parameters and the entry's own; one that is null is left out."""
     replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # another name of the same limit
-    kept = {name: value for name, value in protocol.items() if name not in replaced}
-    return {name: value for name, value in (kept | {**own}).items() if value is not None}
+    params = {name: value for name, value in protocol.items() if name not in replaced}
+    return {name: value for name, value in (params | {**own}).items() if value is not None}
 
 
 def _media(media: Any) -> Any:

@@ -172,14 +172,14 @@ class Entry(BaseModel):
 
     def _check_waivers(self, protocol: Protocol) -> None:
         for parameter, (names, value) in protocol.items():
-            sent = [self.params[name] for name in names if name in self.params]
-            if sent == [value]:
+            values = [self.params[name] for name in names if name in self.params]
+            if values == [value]:
                 if parameter in self.waivers:
                     raise ValueError(f"waivers.{parameter}: is sent as the protocol has it; remove the waiver")
-            elif len(sent) > 1:
+            elif len(values) > 1:
                 raise ValueError(f"params: {' and '.join(names)} are two names of one parameter: send one of them")
             elif parameter not in self.waivers:
-                problem = f"is {sent[0]!r}" if sent else "is not sent"
+                problem = f"is {values[0]!r}" if values else "is not sent"
                 raise ValueError(
                     f"params.{parameter} {problem}, the protocol has {value!r}: send that, or say why under waivers"
                 )
@@ -206,7 +206,7 @@ class ModelEntry(Entry):
     @model_validator(mode="before")
     @classmethod
     def _local_models_take_their_time(cls, data: Any) -> Any:
-        """A local request waits for the batch before its own: giving it up would only throw its answer away."""
+        """Give local requests more time: each waits for the batch before its own, and giving up wastes its answer."""
         if isinstance(data, dict) and data.get("backend") == LOCAL and isinstance(data.get("limits", {}), dict):
             return data | {"limits": {"timeout_s": LOCAL_TIMEOUT_S} | data.get("limits", {})}
         return data
@@ -271,10 +271,10 @@ def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
     if not isinstance(entries, list):
         raise TrapsError(f"{path}: must hold a list `{key}:`")
     context = {"accounts": load_accounts()}
-    found: dict[str, _Entry] = {}
+    read: dict[str, _Entry] = {}
     for number, raw in enumerate(entries, start=1):
-        _add(found, kind, raw, path, f"{key.rstrip('s')} {number}", context)
-    return found
+        _add(read, kind, raw, path, f"{key.rstrip('s')} {number}", context)
+    return read
 
 
 def _add(
@@ -344,10 +344,10 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 def answering_version(evaluation: Evaluation) -> str:
     """Return the version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
     entry = get_model(evaluation.model)
-    sent: list[Any] = [effective_params(entry, evaluation.regime)]
-    sent += [profile_digest(entry.media)] if entry.media else []
-    sent += [["thinking", *entry.thinking]] if entry.thinking else []  # decides what is read of an answer
-    return digest([entry.id, entry.endpoint, *sent])[:16]
+    parts: list[Any] = [effective_params(entry, evaluation.regime)]
+    parts += [profile_digest(entry.media)] if entry.media else []
+    parts += [["thinking", *entry.thinking]] if entry.thinking else []  # decides what is read of an answer
+    return digest([entry.id, entry.endpoint, *parts])[:16]
 
 
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:

@@ -38,17 +38,16 @@ class Exchange:
         """Whether a server said that it did what it was asked to."""
         return self.status is not None and 200 <= self.status < 300
 
-    def may_be_billed(self, status: int | None = None, *, is_explained: bool = False) -> bool:
-        """Return whether the provider may charge for it.
+    def may_be_billed(self, status: int, *, is_explained: bool) -> bool:
+        """Return whether the provider may charge for an answer with a status.
 
-        status: the status in its body, where that counts in the place of the one on the wire. is_explained: whether an
+        status: the one on the wire, or the one in the body, where that counts in its place. is_explained: whether an
         error object of the provider's stands in the place of an answer; a page of a proxy on the way tells nothing of
         what the provider did.
         """
         if self.never_left:
             return False
-        status = self.status if status is None else status
-        if status is None or status in _GIVEN_UP:
+        if status in _GIVEN_UP:
             return True
         return not (400 <= status < 500 or status in _NOT_TAKEN or (is_explained and status >= 500))
 

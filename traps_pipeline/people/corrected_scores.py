@@ -23,7 +23,7 @@ from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,
     SEED,
-    Drawn,
+    Resampling,
     draw_scenarios,
     figures_of,
     figures_of_shares,
@@ -46,10 +46,10 @@ def panel_errors(
     """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows; none where nothing was labelled."""
     rows = []
     if _is_labelled(labels):
-        drawn = _drawn(verdicts, resamples, seed)
+        resampling = _drawn(verdicts, resamples, seed)
         rows = [
             _errors_row(labels, task, draws, joined_epochs(verdicts["panel"]))
-            for task, draws in _errors(labels, drawn).items()
+            for task, draws in _errors(labels, resampling).items()
         ]
     return pd.DataFrame(rows, columns=pd.Index(PANEL_ERRORS.names))
 
@@ -62,8 +62,8 @@ def corrected(
     nothing = pd.DataFrame(columns=pd.Index(CORRECTED.names))
     if not _is_labelled(labels):
         return nothing
-    drawn = _drawn(verdicts, resamples, seed)
-    errors = _errors(labels, drawn)
+    resampling = _drawn(verdicts, resamples, seed)
+    errors = _errors(labels, resampling)
     if len(errors) < len(ABOUT_ANSWERS):
         return nothing
     taxonomies = [taxonomy_of(dataset) for dataset in verdicts["dataset"]]
@@ -72,7 +72,7 @@ def corrected(
     panel, rows = joined_epochs(verdicts["panel"]), list[dict[str, Any]]()
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
-        for dataset, figures in _entry(group, f"{model}|{regime}", drawn, errors).items():
+        for dataset, figures in _entry(group, f"{model}|{regime}", resampling, errors).items():
             entry = {"model": model, "regime": regime, "dataset": dataset, "panel": panel}
             rows.append(entry | {"n_runs": _runs(group, dataset)} | figures)
     return pd.DataFrame(rows, columns=pd.Index(CORRECTED.names))
@@ -97,12 +97,12 @@ def _is_labelled(labels: pd.DataFrame) -> bool:
     return bool(labels["task"].isin(list(ABOUT_ANSWERS)).any())
 
 
-def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Drawn:
+def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Resampling:
     items = verdicts[["scenario_id"]].assign(taxonomy=[taxonomy_of(dataset) for dataset in verdicts["dataset"]])
     return draw_scenarios(items, resamples, seed)
 
 
-def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
+def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
     """Return the panel's sensitivity and specificity by labelled task and draw; NaN without people's yes, or no."""
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
@@ -113,13 +113,13 @@ def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
         counts = np.stack([truth & panel, truth, ~truth & ~panel, ~truth], axis=1) * stratum_weights(answers)[:, None]
         taxonomies = np.array([taxonomy_of(dataset) for dataset in answers["dataset"]])
         total, having = np.zeros(()), np.zeros(counts.shape[1] // 2)
-        for taxonomy, (ids, weights) in drawn.scenarios.items():
+        for taxonomy, (ids, weights) in resampling.scenarios.items():
             here = taxonomies == taxonomy
             by_scenario = np.zeros((len(ids), 1, counts.shape[1]))
             np.add.at(by_scenario[:, 0], ids.get_indexer(pd.Index(answers["scenario_id"][here])), counts[here])
             total = total + resampled_sums(weights, by_scenario)[0]
             having = having + (by_scenario[:, 0, 1::2] > 0).sum(axis=0)
-        errors[task] = shares_of(with_unseen(total, having, drawn.unseen(task, len(having))))
+        errors[task] = shares_of(with_unseen(total, having, resampling.unseen(task, len(having))))
     return errors
 
 
@@ -143,7 +143,7 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
     }
 
 
-def _entry(group: pd.DataFrame, named: str, drawn: Drawn, errors: Errors) -> dict[str, dict[str, float]]:
+def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Errors) -> dict[str, dict[str, float]]:
     """Return the figures of one model and regime, judged and corrected, by dataset."""
 
     def right(sums: np.ndarray, in_mean: bool) -> np.ndarray:
@@ -151,8 +151,8 @@ def _entry(group: pd.DataFrame, named: str, drawn: Drawn, errors: Errors) -> dic
         fixed = [_corrected_ends(shares[:, k], errors[task]) for k, task in enumerate(SHARES)]
         return figures_of_shares(np.stack(fixed, axis=1))
 
-    sums = run_sums(group, drawn, named)
-    both = [means_over_runs(sums, figures, drawn.resamples + 1) for figures in (figures_of, right)]
+    sums = run_sums(group, resampling, named)
+    both = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (figures_of, right)]
     return {
         dataset: {**with_intervals(RESAMPLED, figures), **with_intervals(RESAMPLED, both[1][dataset], "_corrected")}
         for dataset, figures in both[0].items()

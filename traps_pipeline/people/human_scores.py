@@ -45,8 +45,8 @@ def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
     counts = decision_counts(clips).mul(stratum_weights(clips), axis=0)
     items = pd.concat([clips[["dataset", "scenario_id"]].assign(run=1), counts[COUNTS]], axis=1)
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
-    drawn = draw_scenarios(items, resamples, seed)
-    means = means_over_runs(run_sums(items, drawn, "people"), figures_of, resamples + 1)
+    resampling = draw_scenarios(items, resamples, seed)
+    means = means_over_runs(run_sums(items, resampling, "people"), figures_of, resamples + 1)
     rows = [_row(dataset, figures, _of(clips, dataset)) for dataset, figures in means.items()]
     return pd.DataFrame(rows, columns=pd.Index(HUMAN_ROW.names))
 

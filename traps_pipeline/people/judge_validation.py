@@ -250,8 +250,8 @@ def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
         return np.nan, np.nan, np.nan
     cells = np.bincount(2 * one.astype(int) + other, minlength=4)  # no and no, no and yes, yes and no, yes and yes
     rng = np.random.default_rng(SEED)
-    drawn, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
-    shares = drawn + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
+    gamma, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
+    shares = gamma + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
     shares /= shares.sum(axis=-1, keepdims=True)
     p, q = shares[..., 2] + shares[..., 3], shares[..., 1] + shares[..., 3]
     chance = p * q + (1 - p) * (1 - q)

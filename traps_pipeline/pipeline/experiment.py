@@ -51,7 +51,7 @@ class Experiment(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _what_the_file_describes_is_its_own(cls, data: Any) -> Any:
-        """A model may be named or described; `judges`, `panels` and `accounts` describe what no registry has."""
+        """Move described models, `judges`, `panels` and `accounts` to `own`; a model may be named or described."""
         if not isinstance(data, dict):
             return data
         if "own" in data:

@@ -101,8 +101,8 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
     lineage, cells = Lineage(workspace), StudyPartitions(workspace, experiment.name).cells
 
     def behind(stage: str) -> Iterator[str]:
-        wanted = cells if stage in stages else ()
-        return (key for key in wanted if lineage.status(stage, key).kind != "fresh")
+        keys = cells if stage in stages else ()
+        return (key for key in keys if lineage.status(stage, key).kind != "fresh")
 
     asked = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
     panel = load_panel(workspace.study.panel) if "votes" in stages else ()
@@ -122,5 +122,6 @@ def _preflight(workspace: Workspace, participants: _Participants, say: Callable[
 
     checks = preflight(workspace, models, participants.judges)
     for check in checks:
-        say(check.line)
+        if not check.problems:  # they are what is raised
+            say(check.line)
     require_sound(checks)

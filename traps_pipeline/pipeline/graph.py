@@ -122,10 +122,10 @@ class Stage:
         """Return values of the table's partition columns for a key."""
         return {} if self.scheme is None or key is None else self.scheme.columns(key)
 
-    def wanted(self, wanted: StudyPartitions) -> list[str | None]:
+    def wanted(self, partitions: StudyPartitions) -> list[str | None]:
         """Return the keys that a study wants, in key order."""
-        keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(wanted)
-        return [key for key in keys if self.wants(wanted, key)]
+        keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(partitions)
+        return [key for key in keys if self.wants(partitions, key)]
 
 
 DECLARED: dict[str, Stage | Source] = {}  # by name; filled as `defs` is loaded

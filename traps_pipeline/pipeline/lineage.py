@@ -9,7 +9,7 @@ tables, failed calls.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -46,10 +46,16 @@ class Lineage:
         workspace.store.look()
         self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
         self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
+        self._there = cache(self._keys_there)
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
         """Return versions of everything that is there to make a partition from, by name."""
-        nodes = [(parent, k) for parent, keys in self.graph.parents(stage, key).items() for k in keys]
+        nodes = [
+            (parent, k)
+            for parent, keys in self.graph.parents(stage, key).items()
+            for k in keys
+            if (there := self._there(parent)) is None or k in there
+        ]
         versions = {name_of(node): self.version(*node) for node in nodes}
         return {name: version for name, version in versions.items() if version is not None}
 
@@ -67,7 +73,7 @@ class Lineage:
         return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def made_at(self, name: str, key: str | None) -> int:
-        """When a partition was written (ns since 1970); 0 where there is none."""
+        """Return when a partition was written (ns since 1970); 0 where there is none."""
         stage = self.graph[name]
         path = _report_state(self._workspace, stage)
         if stage.table is not None:
@@ -92,7 +98,8 @@ class Lineage:
         return ""
 
     def waits(self, name: str, key: str | None) -> bool:
-        """Return whether something above is outdated or must be made first, but for paid things that are not needed."""
+        """Return whether something above is outdated, is gone since this was made, or must be made first, but for paid
+        things that are not needed."""
         of_stage = self.graph[name].parents
         parents = {
             parent: keys
@@ -101,7 +108,15 @@ class Lineage:
             and not (of_stage[parent].need == "none" and self.graph[parent].cost == "money")
         }
         above = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
-        return any(self.status(*node).outdated for node in above) or bool(self.blocked(name, key, current=True))
+        state = self.state(name, key)
+        gone = (
+            node for node in above if state and name_of(node) in state.inputs and self.status(*node).kind == "missing"
+        )
+        return (
+            any(self.status(*node).outdated for node in above)
+            or any(gone)  # without it, figures would be made anew from less than before
+            or bool(self.blocked(name, key, current=True))
+        )
 
     def _unusable(self, name: str, key: str | None, current: bool) -> str:
         if damage := self.damage(name, key):
@@ -114,6 +129,14 @@ class Lineage:
         blocking = {check.name for check in self.graph[name].checks if check.blocks}
         failed = [check for check in self._workspace.failed_checks(name, key) if check in blocking]
         return f"does not pass its check {failed[0]}" if failed else ""
+
+    def _keys_there(self, name: str) -> Set[str] | None:
+        """Return the keys of a table's files, since a study has few of all that there could be; None for what has no
+        partitions in a table."""
+        if self.graph.source(name) is not None or (stage := self.graph[name]).table is None or stage.scheme is None:
+            return None
+        files = (tuple(partition.values()) for partition in self._workspace.tables.partitions(stage.table))
+        return {key for values in files if (key := stage.scheme.key_of.get(values)) is not None}
 
     def _state(self, name: str, key: str | None) -> State | None:
         stage = self.graph[name]
@@ -148,7 +171,7 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[st
 
 
 def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None:
-    """What files for people (which are no table) were made from, in a folder beside them."""
+    """Write what a stage's files for people were made from, in a folder beside them."""
     workspace.store.write({_report_state(workspace, stage): json.dumps(asdict(state)).encode()})
 
 

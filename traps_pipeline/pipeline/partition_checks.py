@@ -46,17 +46,17 @@ class StageChecks:
                     if damage := lineage.damage(parent, above):
                         yield _evaluation(parent, CURRENT, above, {"damaged": damage})
 
-    def of_made(self, key: str | None, made: StageOutput) -> Iterator[dg.AssetCheckEvaluation]:
+    def of_made(self, key: str | None, output: StageOutput) -> Iterator[dg.AssetCheckEvaluation]:
         """Evaluate every check of a partition that was just written."""
         stage, wrong = self._stage, dict[str, Any]()
         if stage.table is not None:
             damage = self._workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
             wrong |= {"damaged": damage} if damage else {}
-        if made.tally.errors:
-            wrong["failed"] = _failed_calls(made.tally.errors)
+        if output.tally.errors:
+            wrong["failed"] = _failed_calls(output.tally.errors)
         yield self._evaluate(CURRENT, key, wrong)
         for check in stage.checks:
-            problems = check.wrong(self._workspace, key, made)
+            problems = check.wrong(self._workspace, key, output)
             file = self._workspace.failed_check(stage.name, check.name, key)
             if problems:
                 self._workspace.store.write({file: json.dumps(problems, default=str).encode()})

@@ -38,6 +38,11 @@ class Partitioning:
         """Every key, to look one up."""
         return frozenset(self.keys)
 
+    @cached_property
+    def key_of(self) -> Mapping[tuple[str, ...], str]:
+        """Every key by the values of its columns, as the path of a file has them."""
+        return {tuple(map(str, self.columns(key).values())): key for key in self.keys}
+
     def between(self, first: str, last: str) -> Sequence[str]:
         """Return the keys of a range as Dagster has them: of two dimensions, the rectangle between its corners."""
         spans = []
@@ -100,7 +105,7 @@ class Pairs:
 
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
-        return [one for one, made in self.below.items() if key in made]
+        return [parent for parent, keys in self.below.items() if key in keys]
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,20 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base.digests import digest
+from traps_pipeline.base.files import write_bytes
+from traps_pipeline.base.paths import user_cache
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 
 NOTES = "inputs.json"  # of the archive: the digest of each piece's inputs
+_DRAWN_BY = ("matplotlib", "pandas", "jinja2")  # libraries whose versions decide what a piece looks like
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same pieces are the same bytes
 
 
@@ -25,13 +31,15 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same pieces are th
 class Piece:
     """One part of an asset. reads: the stages and sources whose versions decide whether it is made again.
 
-    inputs: where not whole tables matter, the part that does, as JSON; it is compared instead of versions.
+    inputs: where not whole tables matter, the part that does, as JSON; it is compared instead of versions. is_shared:
+    whether every study has the same; it is then made once for a user.
     """
 
     name: str
     make: Callable[[], bytes]
     reads: Sequence[str] = ()
     inputs: Any = None
+    is_shared: bool = False
 
 
 def make_pieces(
@@ -40,19 +48,57 @@ def make_pieces(
     """Return the content of all pieces by name, and the names of those whose inputs or code changed: made again."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
-    versions = Lineage(workspace).inputs(stage, None)
+    versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
     inputs, contents, remade = dict[str, str](), dict[str, bytes](), list[str]()
     for piece in pieces:
         own = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
         inputs[piece.name] = digest([code, own if piece.inputs is None else piece.inputs])
         known, content = former.get(piece.name, ("", b""))
         if known != inputs[piece.name]:
-            content = piece.make()
+            content = shared.get(piece, inputs[piece.name]) if piece.is_shared else piece.make()
             remade.append(piece.name)
         contents[piece.name] = content
+    shared.keep()
     if remade or former.keys() != contents.keys():
         workspace.store.write({path: _archive(inputs, contents)})
     return contents, remade
+
+
+class _Shared:
+    """An archive in the user's cache folder of the pieces that are the same in every study.
+
+    What cannot be read or written there is as if it were not there.
+    """
+
+    def __init__(self, asset: str) -> None:
+        self._asset, self._libraries = asset, [*map(version, _DRAWN_BY)]
+        self._pieces: dict[str, tuple[str, bytes]] | None = None
+        self._is_new = False
+
+    def get(self, piece: Piece, inputs: str) -> bytes:
+        """Return the content of a piece, made if it is not there."""
+        if self._pieces is None:
+            self._pieces = {}
+            with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
+                self._pieces = _read(self._path.read_bytes())
+        wanted = digest([inputs, *self._libraries])
+        known, content = self._pieces.get(piece.name, ("", b""))
+        if known != wanted:
+            content = piece.make()
+            self._pieces[piece.name], self._is_new = (wanted, content), True
+        return content
+
+    def keep(self) -> None:
+        """Store what was made."""
+        if self._pieces and self._is_new:
+            inputs = {name: of for name, (of, _) in self._pieces.items()}
+            contents = {name: content for name, (_, content) in self._pieces.items()}
+            with suppress(OSError, RuntimeError):
+                write_bytes(self._path, _archive(inputs, contents))
+
+    @property
+    def _path(self) -> Path:
+        return user_cache() / f"{self._asset}.pieces.zip"
 
 
 def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:

@@ -38,13 +38,13 @@ class _Grid:
             yield row_of[row], column_of[column]
 
     def range(self, top: int, bottom: int, left: int, right: int) -> Range:
-        """From one corner of a rectangle to the other; both belong to it."""
+        """Return the range from one corner of a rectangle to the other; both belong to it."""
         first, last = (self.rows[top], self.columns[left]), (self.rows[bottom], self.columns[right])
         return "|".join(filter(None, first)), "|".join(filter(None, last))
 
 
 def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator[Range]:
-    """As few ranges as there can be that together are exactly the keys."""
+    """Yield as few ranges as there can be that together are exactly the keys."""
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
         return

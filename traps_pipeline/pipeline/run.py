@@ -40,7 +40,7 @@ class WalkResult:
 
 @contextmanager
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
-    """Dagster's history of this workspace, opened by one process at a time (a first opening by two corrupts it).
+    """Open Dagster's history of this workspace, one process at a time: a first opening by two corrupts it.
 
     Runs whose process was killed are marked as failed: a queue would count them for ever. A history that is gone begins
     anew, and so does one that is no history any more, which is kept beside it: what counts stands in the tables.
@@ -92,12 +92,12 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         except DatabaseError as error:
             if again or ("not a database" not in str(error) and "malformed" not in str(error)):
                 raise
-            kept = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
+            aside = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
             for name in ("history", "schedules", "storage"):
                 if (home / name).exists():
-                    kept.mkdir(exist_ok=True)
-                    (home / name).rename(kept / name)
-            progress.current().note(f"{home}: Dagster's history was damaged; it lies in {kept.name}, a new one begins")
+                    aside.mkdir(exist_ok=True)
+                    (home / name).rename(aside / name)
+            progress.current().note(f"{home}: Dagster's history was damaged; it lies in {aside.name}, a new one begins")
         else:
             return instance
     raise AssertionError("unreachable: the second try returns or raises")
@@ -150,14 +150,14 @@ def materialize_stale(
 ) -> WalkResult:
     """Make what is missing or stale of these stages, or of one experiment; KeyboardInterrupt passes through."""
     outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
-    history, wanted = History(instance, graph), StudyPartitions(workspace, experiment)
+    history, partitions = History(instance, graph), StudyPartitions(workspace, experiment)
     tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():
-        for block in graph.blocks([name for name in stages if graph[name].wanted(wanted)]):
-            pending, keys = pending_in(block, Lineage(workspace), history, wanted)
-            for ran in runs.make(pending, runs.ranges(pending, keys), tags):
-                outcome.problems += ran.problems
-                outcome.over_budget |= ran.over_budget
+        for block in graph.blocks([name for name in stages if graph[name].wanted(partitions)]):
+            pending, keys = pending_in(block, Lineage(workspace), history, partitions)
+            for of_range in runs.make(pending, runs.ranges(pending, keys), tags):
+                outcome.problems += of_range.problems
+                outcome.over_budget |= of_range.over_budget
     outcome.problems = [*dict.fromkeys(outcome.problems)]
     outcome.seconds = time.monotonic() - began
     return outcome

@@ -75,11 +75,11 @@ class RunsHere(Runs):
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
             which = "" if one[0] is None else one[0] if one[0] == one[1] else f"{one[0]} to {one[1]}"
             self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {which}")
-            ran = self._execute(stages, one, tags, run_id)
-            result = "; ".join(ran.problems) or "made"
+            outcome = self._execute(stages, one, tags, run_id)
+            result = "; ".join(outcome.problems) or "made"
             self._log(f"run {run_id}: {result}")
             self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
-            yield ran
+            yield outcome
 
     def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> Ran:
         key = one[0] if one[0] == one[1] else None
@@ -98,11 +98,11 @@ class RunsHere(Runs):
         failures = [event for event in result.all_events if event.is_step_failure]
         if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
             raise KeyboardInterrupt
-        ran = problems_of(failures)
-        if not result.success and not ran.problems:
+        outcome = problems_of(failures)
+        if not result.success and not outcome.problems:
             names = ", ".join(stage.name for stage in stages)
-            ran.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
-        return ran
+            outcome.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
+        return outcome
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:

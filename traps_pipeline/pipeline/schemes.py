@@ -24,33 +24,33 @@ LEFT_OUT = frozenset(
     group for group, used in (("mechanism", _HERE.looks_inside), ("arms", bool(_HERE.arms))) if not used
 )
 
-CATEGORY = Partitioning({"category": _HERE.categories}, lambda key: {"category": key}, lambda wanted: wanted.categories)
-DATASET = Partitioning({"dataset": _HERE.datasets}, lambda key: {"dataset": key}, lambda wanted: wanted.datasets)
+CATEGORY = Partitioning({"category": _HERE.categories}, lambda key: {"category": key}, lambda study: study.categories)
+DATASET = Partitioning({"dataset": _HERE.datasets}, lambda key: {"dataset": key}, lambda study: study.datasets)
 EVALUATION = Partitioning(
     {"evaluation": [e.key for e in _HERE.evaluations]},
     lambda key: {},
-    lambda wanted: [e.key for e in wanted.evaluations],
+    lambda study: [e.key for e in study.evaluations],
 )
 CELL = Partitioning(
-    {**DATASET.dimensions, **EVALUATION.dimensions}, lambda key: Cell.parse(key).partition, lambda wanted: wanted.cells
+    {**DATASET.dimensions, **EVALUATION.dimensions}, lambda key: Cell.parse(key).partition, lambda study: study.cells
 )
 # Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
-PROBED = Partitioning({"dataset": _HERE.probed}, lambda key: {"dataset": key}, lambda wanted: wanted.probed)
+PROBED = Partitioning({"dataset": _HERE.probed}, lambda key: {"dataset": key}, lambda study: study.probed)
 EXTRACTION = Partitioning(
     {"extraction": [e.key for e in _HERE.extractions]},
     lambda key: Extraction.parse(key).partition,
-    lambda wanted: [e.key for e in wanted.extractions],
+    lambda study: [e.key for e in study.extractions],
 )
 STATES = Partitioning(
     {**PROBED.dimensions, **EXTRACTION.dimensions},
     lambda key: StatesCell.parse(key).partition,
-    lambda wanted: wanted.states,
+    lambda study: study.states,
 )
-STEERED = Partitioning({"steering": _HERE.steered}, lambda key: {}, lambda wanted: wanted.steered)
+STEERED = Partitioning({"steering": _HERE.steered}, lambda key: {}, lambda study: study.steered)
 STEERING = Partitioning(
     {**DATASET.dimensions, **STEERED.dimensions},
     lambda key: SteeringCell.parse(key).partition,
-    lambda wanted: wanted.steering,
+    lambda study: study.steering,
 )
 
 by_dataset = ByDimension("dataset")

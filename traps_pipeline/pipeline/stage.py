@@ -79,7 +79,7 @@ def stage(
     cost: Cost = "",
     checks: Sequence[Check] = (),
     kinds: Collection[str] = ("parquet",),
-    wants: Callable[[StudyPartitions, Any], bool] = lambda wanted, key: True,
+    wants: Callable[[StudyPartitions, Any], bool] = lambda study, key: True,
     lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
     takes: RunResources | None = None,
     shared: ConcurrentBuild | None = None,
@@ -95,8 +95,8 @@ def stage(
     def declare(function: Callable[[Workspace, Any], Any]) -> Stage:
         @wraps(function)
         def make(workspace: Workspace, key: Any) -> StageOutput:
-            made = function(workspace, key)
-            return made if isinstance(made, StageOutput) or isinstance(table, str) else _with_preview(table, made)
+            output = function(workspace, key)
+            return output if isinstance(output, StageOutput) or isinstance(table, str) else _with_preview(table, output)
 
         above = [one if isinstance(one, Parent) else of(one) for one in parents]
         one = Stage(

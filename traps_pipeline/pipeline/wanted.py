@@ -51,8 +51,8 @@ class StudyPartitions:
         """Categories with scenarios, and those whose scenarios were all discarded since their table was made."""
         if self._workspace is None:
             return [*CATEGORIES]
-        made = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
-        return [c for c in ALL_CATEGORIES if c in made or c in self._present]
+        existing = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
+        return [c for c in ALL_CATEGORIES if c in existing or c in self._present]
 
     @cached_property
     def _present(self) -> list[str]:
@@ -74,9 +74,9 @@ class StudyPartitions:
         return bool({*self.datasets} & {*DATASETS})
 
     def _datasets(self, asked: Iterable[Asked]) -> list[str]:
-        there = {dataset for category in self._present for dataset in all_datasets_of(category)}
+        present = {dataset for category in self._present for dataset in all_datasets_of(category)}
         named = {dataset for experiment in asked for dataset in experiment.datasets}
-        return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in there & named]
+        return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in present & named]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:
@@ -139,9 +139,11 @@ class StudyPartitions:
         """Datasets whose hidden states are extracted."""
         datasets = self._inside[0] if self._inside else []
         asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
-        there = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
-        there |= {made for made, of in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if of in there}
-        return [d for d in PROBED_DATASETS if d in there]
+        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
+        existing |= {
+            dataset for dataset, of in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if of in existing
+        }
+        return [d for d in PROBED_DATASETS if d in existing]
 
     @cached_property
     def extractions(self) -> list[Extraction]:

@@ -44,8 +44,8 @@ class Ratings:
         judged: values, (items, judges), all INVALID if it was not judged; and whether it was judged, (items,)."""
         by = [*self.answer]
         judged = self.answers.loc[self.answers["task"].isin(tasks), by]
-        found = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
-        rows = found["row"].to_numpy(float)
+        merged = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
+        rows = merged["row"].to_numpy(float)
         is_judged = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
         values[is_judged] = self.values[rows[is_judged].astype(np.int64)]
@@ -70,8 +70,8 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
     answers = votes.loc[first, [*answer, "epoch", "benchmark_version"]].reset_index(drop=True)
     first_votes = votes.loc[first, ["task", "side"]]
     answers["task"] = np.where(first_votes["task"] == "correctness", "correctness", first_votes["side"] + "_abstention")
-    whole = asked.all(axis=1)
-    return Ratings(answers.loc[whole].reset_index(drop=True), values[whole], seats, answer)
+    complete = asked.all(axis=1)
+    return Ratings(answers.loc[complete].reset_index(drop=True), values[complete], seats, answer)
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -38,8 +38,10 @@ def card(manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapp
         "source_datasets": ["original"],
         "configs": [_config(table, places) for table in tables if table.name in _WITH_CLIPS],
     }
-    written = yaml.safe_dump(header, sort_keys=False, allow_unicode=True)
-    return environment().get_template("card.md.j2").render(header=written, tables=tables, places=places, **manifest)
+    front_matter = yaml.safe_dump(header, sort_keys=False, allow_unicode=True)
+    return (
+        environment().get_template("card.md.j2").render(header=front_matter, tables=tables, places=places, **manifest)
+    )
 
 
 def _config(table: Table[Any], places: Mapping[str, str]) -> dict[str, Any]:

@@ -79,16 +79,16 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
         raise TrapsError(
             f"{benchmark}: is not one draw of one seed; draw one with `traps benchmark sample` into a new folder"
         )
-    kept = Reveal(seed=seeds.pop(), nonce=secrets.token_hex(32))
+    secret = Reveal(seed=seeds.pop(), nonce=secrets.token_hex(32))
     release, draws = load_release(benchmark / "benchmark.yaml"), {n: t.wanted for n, t in sorted(tallies.items())}
     published = Commitment(
         **release.model_dump(include={"name", "version", "canary"}),
         draws=draws,
-        seed=_sealed_seed(kept, draws),
-        specs={id_: _sealed_spec(kept, spec) for id_, spec in sorted(specs.items())},
+        seed=_sealed_seed(secret, draws),
+        specs={id_: _sealed_spec(secret, spec) for id_, spec in sorted(specs.items())},
         made_with=_made_with(),
     )
-    write_text(reveal, kept.model_dump_json(indent=1) + "\n")
+    write_text(reveal, secret.model_dump_json(indent=1) + "\n")
     reveal.chmod(0o600)
     write_text(commitment, published.model_dump_json(indent=1) + "\n")
     return published

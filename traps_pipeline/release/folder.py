@@ -145,7 +145,7 @@ def _held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
 
 
 def _pages(folder: _Folder, content: Content, options: Options) -> None:
-    """Everything but tables and clips."""
+    """Write everything but tables and clips."""
     canary = content.release.canary
     tables = OPEN if options.held_out is None else HELD_OUT
     licence = (ROOT / LICENCE).read_text(encoding="utf-8")

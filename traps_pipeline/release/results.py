@@ -67,19 +67,19 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
     asked: dict[str, list[pd.Timestamp]] = {}
     for row in answers:
         asked.setdefault(row["model"], []).append(row["created_at"])
-    written = []
+    files = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
         when = max(asked[str(model)])
         hub = [_hub_entry(row, dataset, when) for row in entries]
-        written.append(f"{HUB}/{model}.yaml")
-        write_text(target / written[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
+        files.append(f"{HUB}/{model}.yaml")
+        write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
         record = _ever_record(str(model), entries, dataset, who, when, release)
         name = uuid.UUID(digest(record)[:32], version=4)  # the collection wants random ones; these are the content's
-        written.append(f"{EVER}/{release.name}/{who.made(str(model))}/{model}/{name}.json")
-        write_text(target / written[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+        files.append(f"{EVER}/{release.name}/{who.made(str(model))}/{model}/{name}.json")
+        write_text(target / files[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     write_bytes(target / PARQUET, table_bytes(LEADERBOARD, board))
-    return [*written, PARQUET]
+    return [*files, PARQUET]
 
 
 def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:

@@ -265,7 +265,7 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _numbers(verified: Verified, submission: Submission) -> None:
-    """Verdicts, metrics and leaderboard again from the votes, and how the submission's numbers differ from them."""
+    """Compute verdicts, metrics and leaderboard from the votes; note how the submission's numbers differ from them."""
     own = id_of_seats(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))

@@ -44,8 +44,8 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
     """
     pairs = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     figures: dict[str, Figure] = {}
-    for (name, shown), (taxonomy, sides) in product(_SHEETS.items(), pairs.groupby("taxonomy", sort=True)):
-        filmed = arms.loc[arms["clip"].notna() & arms["arm"].isin(shown)]
+    for (name, arm_names), (taxonomy, sides) in product(_SHEETS.items(), pairs.groupby("taxonomy", sort=True)):
+        filmed = arms.loc[arms["clip"].notna() & arms["arm"].isin(arm_names)]
         own = filmed.loc[filmed["scenario_id"].isin(sides["scenario_id"])]
         if len(own):
             counts = own.groupby("scenario_id")["arm"].nunique().sort_index()

@@ -141,10 +141,10 @@ def figure_card(report: FigureReport, sources: Sources) -> Card:
 def picture_card(picture: Picture) -> Card:
     """Return the card of pictures made from clips."""
     try:
-        drawn = [_picture(name, figure, picture.kind) for name, figure in picture.figures().items()]
+        images = [_picture(name, figure, picture.kind) for name, figure in picture.figures().items()]
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
-    pictures = {f"{k}" if k > 1 else "": each for k, each in enumerate(drawn, 1)}
+    pictures = {f"{k}" if k > 1 else "": each for k, each in enumerate(images, 1)}
     return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
 
 

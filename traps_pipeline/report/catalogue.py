@@ -86,8 +86,8 @@ class TableReport:
         if not results.is_study and not self.recomputed:
             return []
         remarks = [results.judged_by] if _is_judged(self.reads) else []
-        shown = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
-        tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in shown]
+        with_columns = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
+        tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in with_columns]
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:

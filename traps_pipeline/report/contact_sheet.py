@@ -97,9 +97,11 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
     """Return the pairs that have both sides, occlusion first, as frames of two rows indexed by side."""
-    whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
-    whole = whole.assign(place=whole["dataset"].map(DATASETS.index)).sort_values(["place", "sub_scenario", "pair_id"])
-    return [pair.set_index("side") for _, pair in whole.groupby("pair_id", sort=False)]
+    complete = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
+    complete = complete.assign(place=complete["dataset"].map(DATASETS.index)).sort_values(
+        ["place", "sub_scenario", "pair_id"]
+    )
+    return [pair.set_index("side") for _, pair in complete.groupby("pair_id", sort=False)]
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:

@@ -23,8 +23,8 @@ _SCORES = {"states": "states", "margin": "first token", "sentences": "whole abst
 _CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
 
 
-def _joined(said: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
-    return lambda results: " ".join(said(results))
+def _joined(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
+    return lambda results: " ".join(sentences(results))
 
 
 def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -56,7 +56,7 @@ def states_and_output(results: Results) -> Iterator[str]:
 
 @_joined
 def lens(results: Results) -> Iterator[str]:
-    """By how much the guided prompt moves the margin of each side at the last layer and at the one before."""
+    """Yield by how much the guided prompt moves the margin of each side at the last layer and at the one before."""
     for model, of in _models(results.lens):
         means = of.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
@@ -79,7 +79,7 @@ def lens(results: Results) -> Iterator[str]:
 
 @_joined
 def probe_baselines(results: Results) -> Iterator[str]:
-    """On how many pairs states are above every raw input, the margin and the noise; within and across datasets."""
+    """Yield on how many pairs states beat every raw input, the margin and the noise; within and across datasets."""
     for model, of in _models(beside(results)):
         states, noise, spread = (of[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
         beaten = np.column_stack([of[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])

@@ -110,29 +110,29 @@ LEGEND = {
 }
 
 
-def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
+def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
     """Return LEADERBOARD rows, with ROBUST figures and further notes, as text: a table for each panel, best first."""
-    return "\n".join(table_text(table) for table in leaderboards(board, robust, said, brief=True))
+    return "\n".join(table_text(table) for table in leaderboards(board, robust, notes, brief=True))
 
 
-def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
+def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
     """Return LEADERBOARD rows, with ROBUST figures and further notes, as Markdown with its legend, best first."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
-    tables = leaderboards(board, robust, said, brief=True)
+    tables = leaderboards(board, robust, notes, brief=True)
     return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
 
 
 def leaderboards(
-    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = (), *, brief: bool = False
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
     """Return tables of LEADERBOARD rows for each panel: one that ranks the entries, then one for each other dataset.
 
     The first is `overall`, or the board's first dataset if no model has all four. An entry without a row comes last.
-    said: further notes of the first table. brief: the first of each panel alone, narrower.
+    notes: further notes of the first table. brief: the first of each panel alone, narrower.
     """
     panels = [_of_one_panel(part, robust, brief, suffix) for suffix, part in _by_panel(board)]
     tables = [table for of_panel in panels for table in of_panel[: 1 if brief else None]]
-    return [replace(tables[0], notes=[*tables[0].notes, *said]), *tables[1:]]
+    return [replace(tables[0], notes=[*tables[0].notes, *notes]), *tables[1:]]
 
 
 def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:

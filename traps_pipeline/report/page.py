@@ -27,15 +27,15 @@ def report_html(
     explorer: str = "",
     title: str = "TRAPSBench report",
     robust: pd.DataFrame | None = None,
-    said: Sequence[str] = (),
+    notes: Sequence[str] = (),
     terms: Mapping[str, str] | None = None,
 ) -> str:
     """Render the report as one page that opens from disk and makes no network request.
 
     Cards that were run are shown, tables in a collapsed appendix; of the others the reasons are listed. With `address`
-    every number is a link to the items behind it. said: notes below the leaderboard; terms: words of the legend.
+    every number is a link to the items behind it. notes: those below the leaderboard; terms: words of the legend.
     """
-    boards = leaderboards(board, robust, said)
+    boards = leaderboards(board, robust, notes)
     ranked = [table for table in boards if table.title == boards[0].title]  # one for each panel
     others = [
         Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(

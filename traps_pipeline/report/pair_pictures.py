@@ -69,11 +69,11 @@ class PairPictures:
         visual = self.items.loc[self.items["dataset"].isin(["occlusion", "chaotic"])] if len(self.items) else self.items
         six = six_pairs(self.items) if len(self.items) else self.items
         example = worked_example(self.workspace)
-        shown = [_as_json(example.pair), example.model, example.words] if example else []
+        inputs = [_as_json(example.pair), example.model, example.words] if example else []
         return [
             Picture("worked_example", "Worked example: a pair, the answers, the panel’s reading, the verdicts",
                     lambda: {"worked_example": self._example(example)},
-                    ("items", "responses", "votes", "verdicts"), shown),
+                    ("items", "responses", "votes", "verdicts"), inputs),
             Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(six)},
                     ("items",), _as_json(six)),
             Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),

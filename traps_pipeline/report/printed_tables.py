@@ -29,7 +29,7 @@ PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Trans
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
     """Return the paper's table `name` of `tables.csv`, which has its title, its place in the paper and its notes."""
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
-    where = f"as the paper prints it, line {about['line']} of its source"
+    where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
     return PrintedTable(
         name, str(about["title"]), rows.reset_index(drop=True), columns, notes,

@@ -85,7 +85,7 @@ def report_files(
     )
     page = report_html(
         study.board, figures, pictures, tables, findings=study_findings(study), address=address,
-        explorer=EXPLORER if address else "", robust=study.robust, said=remarks,
+        explorer=EXPLORER if address else "", robust=study.robust, notes=remarks,
         terms=INSIDE_TERMS if study.mechanism else None,
     )  # fmt: skip
     markdown = leaderboard_markdown(study.board, study.robust, remarks)

@@ -63,9 +63,9 @@ def _best(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _names(models: list[str]) -> str:
-    """Up to three names, and how many more."""
-    shown, more = models[:3], len(models) - 3
-    parts = [*shown, f"{more} more"] if more > 0 else shown
+    """Return up to three names, and how many more there are."""
+    first, more = models[:3], len(models) - 3
+    parts = [*first, f"{more} more"] if more > 0 else first
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
@@ -83,7 +83,7 @@ def _abstention(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _accuracy(rows: pd.DataFrame) -> Iterator[Finding]:
-    """By how much guided prompting changes Acc and AbsRec of the models that were asked both ways."""
+    """Yield by how much guided prompting changes Acc and AbsRec of the models that were asked both ways."""
     wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
     if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
         changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}

@@ -181,9 +181,9 @@ class PrintedTable:
     @property
     def remarks(self) -> list[str]:
         """The notes, also with the meaning of ± and of a dash if the table has them."""
-        shown = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
-        dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in shown) else []
-        spreads = [self.deviation] if any("±" in cell for cell in shown) else []
+        cells = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
+        dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in cells) else []
+        spreads = [self.deviation] if any("±" in cell for cell in cells) else []
         return [*(note for note in self.notes if note), *spreads, *dashes]
 
     @property
@@ -276,8 +276,8 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
     """Return a table in a scrolling box, notes below, escaped. `address`: numbers link to the items behind them."""
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
-        shown = column.is_number and figure not in ("", NONE)
-        behind = table.trace(row, column.field) if shown and table.trace and address else None
+        is_figure = column.is_number and figure not in ("", NONE)
+        behind = table.trace(row, column.field) if is_figure and table.trace and address else None
         return address(behind) if behind and address else None
 
     return environment().get_template("table.html.j2").render(table=table, marked=table.marked, link=link)
@@ -347,7 +347,7 @@ def _parquet(table: PrintedTable) -> bytes:
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """The style of all figures, needed for drawing and for saving (the SVG salt takes effect only when saving)."""
+    """Apply the style of all figures; drawing and saving both need it (the SVG salt takes effect only when saving)."""
     import matplotlib.style
 
     with matplotlib.style.context(STYLE):

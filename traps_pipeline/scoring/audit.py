@@ -67,8 +67,8 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
         lines.append(f"{group}: {len(rows)} statements: {counts}")
-        shown = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
-        for row in shown.to_dict("records"):
+        listed = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
+        for row in listed.to_dict("records"):
             where = f" (line {row['line']})" if row["line"] else ""
             lines.append(f"  {row['verdict']:<15} {row['statement']}{where}")
             lines.append(f"  {'':<15} published {row['published']}; recomputed {row['recomputed']}")
@@ -165,8 +165,8 @@ def overall_means() -> Iterator[Finding]:
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
             name = f"overall {share} of {model}, {regime}"
-            shown = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
-            yield Finding("overall", name, *shown, verdict, reason, _line("overall"))
+            figures = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
+            yield Finding("overall", name, *figures, verdict, reason, _line("overall"))
 
 
 _REPLICATION = models_of(group="replication")
@@ -191,9 +191,9 @@ def pecs_factors() -> Iterator[Finding]:
             f"rounding allow {low:.4f} to {high:.4f}"
         )
         name = f"PECS of {cell['model']}, {cell['dataset']}, {cell['regime']}"
-        shown = f"{shares['pecs']:.3f}", f"{naive:.4f}"
+        figures = f"{shares['pecs']:.3f}", f"{naive:.4f}"
         group = "replication_per_dataset" if cell["model"] in _REPLICATION else "per_dataset"
-        yield Finding("pecs factors", name, *shown, verdict, "" if verdict == AGREES else reason, _line(group))
+        yield Finding("pecs factors", name, *figures, verdict, "" if verdict == AGREES else reason, _line(group))
 
 
 def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
@@ -241,8 +241,8 @@ def probe_means() -> Iterator[Finding]:
             off = abs(mean - row[column])
             verdict: Verdict = AGREES if off <= 0.0005 + _SLACK else ROUNDING if off <= 0.001 + _SLACK else DIFFERS
             name = f"four-path mean AUROC, {items}, {row['model']}, {row['transfer_type']}"
-            shown = f"{row[column]:.3f}", f"{mean:.5g}"
-            yield Finding("probe means", name, *shown, verdict, line=_line("probe_means"))
+            figures = f"{row[column]:.3f}", f"{mean:.5g}"
+            yield Finding("probe means", name, *figures, verdict, line=_line("probe_means"))
 
 
 def transfer_types() -> Iterator[Finding]:
@@ -308,8 +308,8 @@ def validation_scores() -> Iterator[Finding]:
         reachable = lowest - 0.005 <= printed <= highest + 0.005
         verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
         reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
-        shown = f"{printed:.2f}", f"{ours:.3f}"
-        yield Finding("validation", f"F1, {row['category']}", *shown, verdict, reason, _line("judge_validation"))
+        figures = f"{printed:.2f}", f"{ours:.3f}"
+        yield Finding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
 
 
 def _f1(precision: float, recall: float) -> float:

@@ -63,11 +63,11 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
         [verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1
     )
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
-    drawn = draw_scenarios(items, resamples, seed)
+    resampling = draw_scenarios(items, resamples, seed)
     entries, observed, values = list[tuple[str, str, str]](), list[np.ndarray](), list[np.ndarray]()
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
-        sums = run_sums(group, drawn, f"{model}|{regime}")
+        sums = run_sums(group, resampling, f"{model}|{regime}")
         for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
             entries.append((model, regime, dataset))
             observed.append(mean[1, :, 0])
@@ -149,7 +149,7 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
 
 
 @dataclass(frozen=True)
-class Drawn:
+class Resampling:
     """Weights of scenarios in every resample, after a first draw that takes each scenario once and no unseen one, and
     so gives the figures themselves.
 
@@ -168,15 +168,15 @@ class Drawn:
         return np.concatenate([np.zeros((decisions, 1)), rng.standard_exponential((decisions, self.resamples))], axis=1)
 
 
-def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
+def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling:
     """Draw the weights of the scenarios of items (columns scenario_id, taxonomy)."""
-    drawn = {}
+    by_taxonomy = {}
     for k, taxonomy in enumerate(TAXONOMIES):
         ids = pd.Index(sorted(items.loc[items["taxonomy"] == taxonomy, "scenario_id"].unique()))
         weights = np.random.default_rng([seed, k]).standard_exponential((resamples, len(ids)), np.float32)
         weights = np.ceil(weights * _GRAIN) / _GRAIN
-        drawn[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
-    return Drawn(drawn, resamples, seed)
+        by_taxonomy[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
+    return Resampling(by_taxonomy, resamples, seed)
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> 
     unseen scenario makes it: (.., 3 x decisions, draws).
 
     That is as often as a scenario that has it does on average. scenarios: how many have it, (.., decisions); unseen:
-    weights of `Drawn.unseen`.
+    weights of `Resampling.unseen`.
     """
     size = sums[..., 1::2, 0] / np.maximum(scenarios, 1)
     return np.concatenate([sums, size[..., None] * unseen], axis=-2)
@@ -215,15 +215,15 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
         return np.stack([yes, yes + unseen]) / (decided + unseen)
 
 
-def ends_of_mean(values: pd.Series, drawn: Drawn, named: str) -> np.ndarray:
+def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
     """Return the ends of the mean of values in [0, 1], one for each scenario of the index, (2, 1 + resamples). named:
     as in `run_sums`."""
-    sums = np.zeros((1, 2, 1 + drawn.resamples))
-    for scenarios, weights in drawn.scenarios.values():
+    sums = np.zeros((1, 2, 1 + resampling.resamples))
+    for scenarios, weights in resampling.scenarios.values():
         own = values.reindex(scenarios)
         counts = np.stack([own.fillna(0.0), own.notna()], axis=1).astype(float)
         sums += resampled_sums(weights, counts[:, None])
-    return shares_of(with_unseen(sums, np.array([[len(values)]]), drawn.unseen(named, 1)))[:, 0, 0]
+    return shares_of(with_unseen(sums, np.array([[len(values)]]), resampling.unseen(named, 1)))[:, 0, 0]
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
@@ -250,14 +250,14 @@ def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
     return np.stack([acc[0] * j[0], pecs_of(acc[1], j[1])])
 
 
-def run_sums(group: pd.DataFrame, drawn: Drawn, named: str) -> dict[tuple[str, int], np.ndarray]:
+def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tuple[str, int], np.ndarray]:
     """Return (dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples), for the items of one model
     and regime. A dataset (an arm) may have items of both taxonomies. named: what tells the items' unseen scenarios from
     others'."""
     totals: dict[tuple[str, int], np.ndarray] = {}
     having: dict[tuple[str, int], np.ndarray] = {}
     for taxonomy, items in group.groupby("taxonomy", sort=True):
-        scenarios, weights = drawn.scenarios[str(taxonomy)]
+        scenarios, weights = resampling.scenarios[str(taxonomy)]
         cells = items.groupby(["dataset", "run"], sort=True)
         counts = np.zeros((len(scenarios), cells.ngroups, len(COUNTS)))
         places = scenarios.get_indexer(pd.Index(items["scenario_id"])), cells.ngroup().to_numpy()
@@ -267,7 +267,9 @@ def run_sums(group: pd.DataFrame, drawn: Drawn, named: str) -> dict[tuple[str, i
             key = cast(tuple[str, int], cell)
             totals[key] = totals.get(key, 0) + sums
             having[key] = having.get(key, 0) + n
-    unseen = {dataset: drawn.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {of for of, _ in totals}}
+    unseen = {
+        dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {of for of, _ in totals}
+    }
     return {key: with_unseen(sums, having[key], unseen[key[0]]) for key, sums in totals.items()}
 
 

@@ -172,12 +172,12 @@ def _ties() -> Recomputed:
 def _accuracy_kept() -> Recomputed:
     cells = _by_regime("acc_pct", _video_native())
     means = _means(cells)
-    kept = [
+    counts = [
         sum(abs(row["guided"] - row["standard"]) <= 2 + 1e-9 for row in rows)
         for rows in (means.values(), cells.values())
     ]
-    words = f"{kept[0]} of {len(means)} overall, {kept[1]} of {len(cells)} cells"
-    return Recomputed(words, agrees=2 * kept[0] > len(means) and 2 * kept[1] > len(cells))
+    words = f"{counts[0]} of {len(means)} overall, {counts[1]} of {len(cells)} cells"
+    return Recomputed(words, agrees=2 * counts[0] > len(means) and 2 * counts[1] > len(cells))
 
 
 def _reported_above() -> Recomputed:

@@ -19,7 +19,7 @@ from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,
     SEED,
-    Drawn,
+    Resampling,
     difference,
     draw_scenarios,
     figures_of,
@@ -129,7 +129,7 @@ def hypotheses(
     items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
     items["offered"] = [offered[id_] for id_ in items["item_id"]]
-    drawn = draw_scenarios(items, resamples, seed)
+    resampling = draw_scenarios(items, resamples, seed)
     rows: list[dict[str, Any]] = []
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
         for hypothesis in HYPOTHESES:
@@ -137,7 +137,7 @@ def hypotheses(
             with_items = [(dose, its) for dose, its in by_dose if len(its)]
             if {dose for dose, _ in with_items} - {hypothesis.doses[0], *_in_pairs(hypothesis)}:
                 reference = by_dose[0][1]
-                dose_rows = [_row(hypothesis, dose, its, reference, drawn) for dose, its in with_items]
+                dose_rows = [_row(hypothesis, dose, its, reference, resampling) for dose, its in with_items]
                 rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in dose_rows]
     return _beside_rules(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
 
@@ -153,12 +153,12 @@ def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
 
 
 def _row(
-    hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, drawn: Drawn
+    hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, resampling: Resampling
 ) -> dict[str, Any]:
     """Return the columns of a dose's row, those of rules aside."""
     model, regime = (items[name].iloc[0] for name in ("model", "regime"))
     named = f"{model}|{regime}|{hypothesis.name}"
-    figures = _figures(items, drawn, f"{named}|{dose.name}")
+    figures = _figures(items, resampling, f"{named}|{dose.name}")
     control = items["side"].eq("control").to_numpy()
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     row: dict[str, Any] = {
@@ -191,7 +191,7 @@ def _row(
     if row["refused"] is None:
         names = (hypothesis.doses[0].name, dose.name)
         before, after = (
-            _compared(hypothesis, _figures(some, drawn, f"{named}|{name}"))
+            _compared(hypothesis, _figures(some, resampling, f"{named}|{name}"))
             for some, name in zip((shared, mine), names, strict=True)
         )
         row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[1, 0]}
@@ -199,10 +199,10 @@ def _row(
     return row
 
 
-def _figures(items: pd.DataFrame, drawn: Drawn, named: str) -> np.ndarray:
+def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
     """Return the ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws): of all items per
     run, then the mean over runs."""
-    sums = run_sums(items.assign(dataset="all"), drawn, named)
+    sums = run_sums(items.assign(dataset="all"), resampling, named)
     by_run = []
     for of_run in sums.values():
         rows = dict(zip(_SUMS, of_run, strict=True))

@@ -18,7 +18,7 @@ import pandas as pd
 
 from traps_pipeline.models.judged_answers import is_correct, read_object, to_label
 from traps_pipeline.protocol.regimes import ANSWER_FROM, BY_NAME, WRONG_COSTS, fields_of
-from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Drawn, draw_scenarios, ends_of_mean, with_interval
+from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Resampling, draw_scenarios, ends_of_mean, with_interval
 from traps_pipeline.scoring.metrics import joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import GRADED_CUTS
 
@@ -114,12 +114,12 @@ def graded(
     if not rows:
         return pd.DataFrame(columns=pd.Index(GRADED_CUTS.names))
     items = pd.DataFrame(rows).reindex(columns=[*verdicts.columns, "taxonomy", *_FIGURES])
-    drawn, table = draw_scenarios(items, resamples, seed), []
+    resampling, table = draw_scenarios(items, resamples, seed), []
     starts = np.searchsorted(SCOPES, items["top"] + _ROUNDING, side="right") - 1
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
         scopes = [("all", group), *((_name(k), part) for k, part in group.groupby(starts[group.index]))]
         table += [
-            {"model": model, "regime": regime, "scope": scope, **_row(part, f"{model}|{regime}|{scope}", drawn)}
+            {"model": model, "regime": regime, "scope": scope, **_row(part, f"{model}|{regime}|{scope}", resampling)}
             for scope, part in scopes
             if part["points"].notna().any()
         ]
@@ -136,11 +136,11 @@ def _labels(votes: pd.DataFrame, asked: Mapping[str, Asked]) -> dict[tuple[Any, 
     cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
     chosen = dict[tuple[Any, ...], str]()
     for key, own in cast(Any, cast_votes.groupby(_ANSWER)):
-        said = [
+        labels = [
             asked[key[0]].label_of(value if isinstance(value, str) else None) or ""
             for value in own.loc[own["valid"].astype(bool), "extracted_value"]
         ]
-        label, n = Counter(said).most_common(1)[0] if said else ("", 0)
+        label, n = Counter(labels).most_common(1)[0] if labels else ("", 0)
         if n > len(own) / 2:
             chosen[key] = label
     return chosen
@@ -204,7 +204,7 @@ def _commonest(posterior: Mapping[str, float]) -> str:
     return max(posterior, key=lambda label: posterior[label])
 
 
-def _row(items: pd.DataFrame, named: str, drawn: Drawn) -> dict[str, Any]:
+def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, Any]:
     """Return the figures of some items of a model and regime; a scenario counts once, with the mean over its runs."""
     with_decision = items.loc[items["points"].notna()]
     of = with_decision.groupby("scenario_id")[_FIGURES].mean()
@@ -220,7 +220,7 @@ def _row(items: pd.DataFrame, named: str, drawn: Drawn) -> dict[str, Any]:
         "benchmark_version": joined_versions(items["benchmark_version"]),
     }
     for name, (low, high) in WITH_INTERVAL.items():
-        ends = ends_of_mean((of[name].dropna() - low) / (high - low), drawn, f"{named}|{name}")
+        ends = ends_of_mean((of[name].dropna() - low) / (high - low), resampling, f"{named}|{name}")
         row |= with_interval(name, low + (high - low) * ends, (low, high))
     return row
 

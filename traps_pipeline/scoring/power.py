@@ -72,10 +72,10 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
     observed, ends = np.zeros(STUDIES), np.zeros((STUDIES, 2, RESAMPLES))
     for n in counts:
         answers = rng.multinomial(n, np.outer(control, void).ravel(), size=STUDIES)
-        drawn = rng.standard_gamma(answers[:, :, None], size=(STUDIES, 6, RESAMPLES))
+        gamma = rng.standard_gamma(answers[:, :, None], size=(STUDIES, 6, RESAMPLES))
         unseen = rng.standard_exponential((3, RESAMPLES))
         observed += _pecs(answers[..., None], np.zeros((3, 1)), False)[:, 1, 0] / len(counts)
-        ends += _pecs(drawn, unseen, len(counts) > 1) / len(counts)
+        ends += _pecs(gamma, unseen, len(counts) > 1) / len(counts)
     return observed, ends
 
 

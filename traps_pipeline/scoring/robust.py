@@ -26,7 +26,7 @@ from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     RESAMPLES,
     SEED,
-    Drawn,
+    Resampling,
     difference,
     draw_scenarios,
     ends_of_mean,
@@ -63,9 +63,9 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
     # A scenario is drawn with its items in all datasets and arms.
-    drawn = draw_scenarios(items, resamples, seed)
+    resampling = draw_scenarios(items, resamples, seed)
     rows = [
-        {"model": model, "regime": regime, "arms": list(arms), **_row(group, f"{model}|{regime}", arms, drawn)}
+        {"model": model, "regime": regime, "arms": list(arms), **_row(group, f"{model}|{regime}", arms, resampling)}
         for (model, regime), (arms, group) in cast(Mapping[tuple[str, str], Any], entries).items()
     ]
     return pd.DataFrame(rows, columns=pd.Index(ROBUST.names))
@@ -86,12 +86,12 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
     return sets[best], best
 
 
-def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
+def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resampling) -> dict[str, Any]:
     """Return the columns of an entry's ROBUST row except model, regime and arms."""
     runs = dict(list(items.groupby("run", sort=True)))
-    sums = run_sums(items, drawn, named)
+    sums = run_sums(items, resampling, named)
     kinds = (*DATASETS, *(arm for arm in arms if arm in ROBUST_ARMS))
-    conjunctions = [_conjunction(rows, drawn, f"{named}|conjunction") for rows in runs.values()]
+    conjunctions = [_conjunction(rows, resampling, f"{named}|conjunction") for rows in runs.values()]
     figures = {
         "robust": [
             robust_ends(
@@ -160,11 +160,11 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
     return worst.where((worst == 0) | ~undecided)
 
 
-def _conjunction(items: pd.DataFrame, drawn: Drawn, named: str) -> tuple[np.ndarray, int]:
+def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
     """Return the ends of the share of decided scenarios that `conjunction_of` finds right, (2, draws), and their
     number."""
     decided = conjunction_of(items).dropna()
-    return ends_of_mean(decided, drawn, named), len(decided)
+    return ends_of_mean(decided, resampling, named), len(decided)
 
 
 def _missing(items: pd.DataFrame) -> int:

@@ -49,8 +49,8 @@ class Touched:
         """Return the counts in words."""
         money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
         calls = f"at most {self.answers} answers and {self.votes} votes"
-        asked = f"{len(self.items)} items are asked or judged again: {calls}, {money}"
-        return asked + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
+        cost_text = f"{len(self.items)} items are asked or judged again: {calls}, {money}"
+        return cost_text + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
 
 
 def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
@@ -65,19 +65,19 @@ def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correctio
     ill_posed = changes.get("ill_posed_question", spec["ill_posed_question"]) != spec["ill_posed_question"]
     judged_again = changes.get("answer", spec["ground_truth"]) != spec["ground_truth"] or "labels" in changes
     seats = len(load_panel(workspace.study.panel))
-    found = Touched(question=question, rendered=[spec["scenario_id"]] if renders else [])
+    cost = Touched(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _asked(workspace, spec["taxonomy"]):
         for side in SIDES:
             of_ill_posed = is_ill_posed(dataset) and side == "void"
             again = renders or (ill_posed if of_ill_posed else asked_again)
             item = f"{dataset}:{spec['scenario_id']}:{side}"
             if again or (judged_again and side == "control"):
-                found.items += [] if item in found.items else [item]
-                found.votes += evaluations * seats * (len(tasks_for(side)) if again else 1)
+                cost.items += [] if item in cost.items else [item]
+                cost.votes += evaluations * seats * (len(tasks_for(side)) if again else 1)
             if again:
-                found.answers += evaluations
-                found.dollars = _plus(found.dollars, _dollars(model, evaluations))
-    return found
+                cost.answers += evaluations
+                cost.dollars = _plus(cost.dollars, _dollars(model, evaluations))
+    return cost
 
 
 def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:

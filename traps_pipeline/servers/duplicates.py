@@ -38,7 +38,7 @@ def fingerprint(clip: Path) -> np.ndarray:
 
 
 def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
-    """For each scenario that has others of its family, the nearest of them."""
+    """Return the nearest scenario of the same family, for each that has one."""
     nearest_of = {}
     for family in sorted(set(families.values())):
         names = sorted(name for name in prints if families[name] == family)

@@ -75,7 +75,7 @@ class LabelStore:
 
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
-        """A connection whose changes are committed, and on the disk, when the block ends without an error."""
+        """Open a connection whose changes are committed, and on the disk, when the block ends without an error."""
         try:
             with closing(sqlite3.connect(self.folder / DATABASE, timeout=30, isolation_level=None)) as database:
                 database.execute("PRAGMA synchronous=FULL")

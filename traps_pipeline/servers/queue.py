@@ -23,8 +23,8 @@ MEANINGS: Mapping[QueueName, str] = {
 
 
 def flags(workspace: Workspace) -> pd.DataFrame:
-    """By scenario: how many judged answers have no unanimous panel (`judges`), and how evenly models are divided on the
-    controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
+    """Return by scenario how many judged answers have no unanimous panel (`judges`), and how evenly models are divided
+    on the controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
     rows = current_rows(workspace, VERDICTS, ["scenario_id", "item_id", "side", "n_valid", "correct", "unanimous"])
     judged = rows.loc[rows["n_valid"] > 0]
     split = (~judged["unanimous"].astype(bool)).groupby(judged["scenario_id"]).sum()
@@ -34,9 +34,13 @@ def flags(workspace: Workspace) -> pd.DataFrame:
 
 
 def queue(
-    name: QueueName, scenarios: Sequence[str], reviewed: frozenset[str], found: pd.DataFrame, alike: Mapping[str, float]
+    name: QueueName,
+    scenarios: Sequence[str],
+    reviewed: frozenset[str],
+    flagged: pd.DataFrame,
+    alike: Mapping[str, float],
 ) -> list[str]:
-    """Return the scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. found:
+    """Return the scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. flagged:
     `flags`; alike: by scenario, how far the one that looks most alike is."""
     if name == "all":
         return list(scenarios)
@@ -45,5 +49,5 @@ def queue(
         return waiting
     if name == "alike":
         return sorted((each for each in waiting if each in alike), key=lambda each: (alike[each], each))
-    scores = found[name].to_dict() if len(found) else {}
+    scores = flagged[name].to_dict() if len(flagged) else {}
     return sorted((each for each in waiting if scores.get(each, 0) > 0), key=lambda each: (-scores[each], each))

@@ -97,8 +97,8 @@ class Listening:
 
     def addresses(self) -> dict[str, str]:
         """Return the address to open, by the person it is for ("" where there is one for all)."""
-        shown = f"[{self.host}]" if ":" in self.host else self.host
-        base = self.behind.rstrip("/") or f"http://{shown}:{self.port}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        base = self.behind.rstrip("/") or f"http://{host}:{self.port}"
         tokens = {self.tokens: ""} if isinstance(self.tokens, str) else self.tokens
         return {who: f"{base}/?token={quote(token)}" for token, who in tokens.items()}
 

@@ -28,15 +28,15 @@ def leased(store: Store, work: str, items: int, size: int) -> Generator[range]:
     """Yield ranges of items, at most `size` each: first those that no other process has, then the others as they are
     given back, finished or not. The lease of a range ends when the next one is asked for. Raises TrapsError where no
     lease can be had."""
-    held = list[tuple[str, range]]()
+    leases = list[tuple[str, range]]()
     for first in range(0, items, size):
         name, chunk = f"{work}/{first:07d}", range(first, min(first + size, items))
         lease = store.lease(name)
         if lease is None:
-            held.append((name, chunk))
+            leases.append((name, chunk))
             continue
         with closing(lease):
             yield chunk
-    for name, chunk in held:
+    for name, chunk in leases:
         with alone(store, name):
             yield chunk

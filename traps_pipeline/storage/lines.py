@@ -59,10 +59,10 @@ def append_whole(descriptor: int, content: bytes) -> None:
     size, remaining = os.lseek(descriptor, 0, os.SEEK_END), content
     try:
         while remaining:
-            written = os.write(descriptor, remaining)
-            if not written:
+            count = os.write(descriptor, remaining)
+            if not count:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            remaining = remaining[written:]
+            remaining = remaining[count:]
     except OSError:
         os.ftruncate(descriptor, size)
         raise

@@ -324,10 +324,10 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
     import pyarrow.parquet as pq
 
     stamp = _stamp(path.stat())
-    if (kept := _FOOTERS.get(path)) is None or kept[0] != stamp:
+    if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
         schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
-        kept = _FOOTERS[path] = stamp, State(**json.loads((schema.metadata or {})[_FOOTER])), schema.names
-    return kept[1], kept[2]
+        cached = _FOOTERS[path] = stamp, State(**json.loads((schema.metadata or {})[_FOOTER])), schema.names
+    return cached[1], cached[2]
 
 
 def altered(path: Path) -> str:

@@ -57,7 +57,7 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
     )
     count = 0
     while some := list(islice(files, AT_ONCE)):
-        kept = list[Path]()
+        moved = list[Path]()
         for path in some:
             destination = target.root / path.relative_to(workspace.root)
             if path.is_relative_to(workspace.tables.root):
@@ -68,7 +68,7 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
                 continue
             destination.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, destination)
-            kept.append(destination)
-        target.store.keep(kept)
+            moved.append(destination)
+        target.store.keep(moved)
         count += len(some)
         progress.current().note(f"{count} files lie in {target.place}")

@@ -143,7 +143,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
 
 
 def _require_packable(network: Any, name: str) -> None:
-    """bitsandbytes packs rows of 64 weights on a CPU. Raises TrapsError naming what has others."""
+    """Raise TrapsError naming modules whose rows are no multiple of the 64 weights that bitsandbytes packs on a CPU."""
     odd = [
         part
         for part, module in network.named_modules()

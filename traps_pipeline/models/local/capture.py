@@ -55,16 +55,16 @@ def capturing(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
 ) -> Iterator[Captured]:
     """Keep the pooled states of forward passes made inside; the hooks are gone afterwards, whatever happens."""
-    kept = Captured()
+    captured = Captured()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        kept.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))
+        captured.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))
 
     def block(_: Module, __: Any, output: Any) -> None:
-        kept.raw.append(pool(first_tensor(output), pooling, chosen))
+        captured.raw.append(pool(first_tensor(output), pooling, chosen))
 
     def last(_: Module, __: Any, output: Any) -> None:
-        kept.normed = pool(first_tensor(output), pooling, chosen)
+        captured.normed = pool(first_tensor(output), pooling, chosen)
 
     with ExitStack() as hooks:
         for number, module in enumerate(blocks):
@@ -72,4 +72,4 @@ def capturing(
                 hooks.callback(module.register_forward_pre_hook(embeddings, with_kwargs=True).remove)
             hooks.callback(module.register_forward_hook(block).remove)
         hooks.callback(norm.register_forward_hook(last).remove)
-        yield kept
+        yield captured

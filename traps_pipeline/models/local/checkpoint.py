@@ -174,8 +174,8 @@ def free_bytes(device: str) -> float:
     if device.startswith("cuda"):
         import torch
 
-        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch hands it out again
-        return float(torch.cuda.mem_get_info(device)[0] + kept)
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch hands it out again
+        return float(torch.cuda.mem_get_info(device)[0] + cached)
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

@@ -197,10 +197,10 @@ class LocalModel:
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
             prompt = self._answered(prompt, steering)
-        with steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as kept:
+        with steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
             self.forward(prompt)
-        assert kept.normed is not None and len(kept.raw) == self.n_layers + 1
-        rows = torch.stack([row.float().cpu() for row in (*kept.raw, kept.normed)]).numpy()
+        assert captured.normed is not None and len(captured.raw) == self.n_layers + 1
+        rows = torch.stack([row.float().cpu() for row in (*captured.raw, captured.normed)]).numpy()
         return States(rows[:-1], rows[-1])
 
     def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
@@ -288,15 +288,15 @@ class LocalModel:
         eos = self.network.generation_config.eos_token_id
         ends = {eos} if isinstance(eos, int) else {*eos}
         ended = next((i for i, token in enumerate(tokens) if token in ends), None)
-        kept = tokens if ended is None else tokens[: ended + 1]
+        own_tokens = tokens if ended is None else tokens[: ended + 1]
         with self._processing:
-            text = self.processor.tokenizer.decode(kept, skip_special_tokens=True)
+            text = self.processor.tokenizer.decode(own_tokens, skip_special_tokens=True)
             named = dict[str, float]()
             for token, logprob in first.items():  # several may have one text
                 name = self.processor.tokenizer.decode([token])
                 named[name] = float(np.logaddexp(named.get(name, -np.inf), logprob))
         finish = "length" if ended is None else "stop"
-        return Generated(text, prompt.n_tokens, len(kept), finish, tuple(kept), named)
+        return Generated(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs of a prompt or a batch, on the model's device, pictures in its precision."""
@@ -310,10 +310,10 @@ class LocalModel:
         """Return memory that a row takes at most, by estimate: keys and values, the widest activations, pictures,
         logits."""
         item, vocabulary = self.network.dtype.itemsize, self.network.config.get_text_config().vocab_size
-        kept = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
+        cache = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
         passing = 28 * prompt.n_tokens * self.d_model * item  # a block's widest moment: residual, gate, up and down
         pictures = 8 * sum(value.numel() for value in prompt.inputs.values() if value.is_floating_point()) * item
-        return kept + passing + pictures + 6 * vocabulary * 4
+        return cache + passing + pictures + 6 * vocabulary * 4
 
     @cached_property
     def _cached_width(self) -> int:

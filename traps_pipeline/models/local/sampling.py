@@ -44,7 +44,7 @@ class SeededNucleus:
         before = probabilities.cumsum(dim=-1) - probabilities
         nucleus = probabilities.masked_fill(before >= self._sampling.top_p, 0.0)
         upto = nucleus.cumsum(dim=-1)
-        drawn = torch.tensor([[stream.random()] for stream in self._streams], dtype=upto.dtype, device=upto.device)
-        place = torch.searchsorted(upto, drawn * upto[:, -1:], right=True)
+        uniform = torch.tensor([[stream.random()] for stream in self._streams], dtype=upto.dtype, device=upto.device)
+        place = torch.searchsorted(upto, uniform * upto[:, -1:], right=True)
         place = place.minimum((nucleus > 0).sum(dim=-1, keepdim=True) - 1)  # rounding must not leave the nucleus
         return torch.full_like(scores, -torch.inf).scatter_(1, order.gather(1, place), 0.0)

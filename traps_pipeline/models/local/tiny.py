@@ -193,8 +193,8 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
 
 
 def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides) -> Any:
-    """As E4B is made: sliding and full attention, per-layer embeddings, and upper blocks that read the keys and values
-    of lower ones, below which there are blocks whose keys and values nobody else reads."""
+    """Build a model like E4B: sliding and full attention, per-layer embeddings, and upper blocks that read the keys and
+    values of lower ones, below which there are blocks whose keys and values no other block reads."""
     words = {
         **base,
         "vocab_size_per_layer_input": base["vocab_size"],

@@ -39,7 +39,7 @@ def corrections(workspace: Workspace, category: str) -> str:
 
 
 def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, StageOutput], Any]:
-    return lambda workspace, key, made: find([item.spec for item in made.beside])
+    return lambda workspace, key, output: find([item.spec for item in output.beside])
 
 
 @_stage(
@@ -54,7 +54,7 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
             "outcome_settled",
             "In the replay of the frozen trajectory, every outcome is the ground truth, is settled in time, and has "
             "the margin in its record.",
-            lambda workspace, key, made: unsettled(made.beside),
+            lambda workspace, key, output: unsettled(output.beside),
         ),
         Check(
             "control_certified",
@@ -79,8 +79,8 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
             "answers_balanced",
             "Within a family no answer and no ill-posed text is too frequent, and no scene occurs twice (whole "
             "benchmarks only).",
-            lambda workspace, key, made: (
-                [] if workspace.study.is_subset else problems([item.spec for item in made.beside])
+            lambda workspace, key, output: (
+                [] if workspace.study.is_subset else problems([item.spec for item in output.beside])
             ),
             blocks=False,
         ),
@@ -116,7 +116,7 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
         Check(
             "panel_hides",
             "Nothing decisive has a pixel, shadow included, in any checked frame of an occluded void.",
-            lambda workspace, key, made: {id_: pixels for id_, pixels in made.beside.items() if pixels},
+            lambda workspace, key, output: {id_: pixels for id_, pixels in output.beside.items() if pixels},
         ),
         Check("clips_distinct", "No two clips of a category show the same frames.", _alike, blocks=False),
     ],
@@ -142,7 +142,7 @@ def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, filmed_arms.seconds_left),
-    wants=lambda wanted, key: bool({*wanted.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
+    wants=lambda study, key: bool({*study.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
     lost=filmed_arms.unmade,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
@@ -156,7 +156,7 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     sides: dict[str, list[str]] = {}
     for row in output.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)
-    return {pair: found for pair, found in sides.items() if tuple(sorted(found)) != sides_of(str(key))}
+    return {pair: present for pair, present in sides.items() if tuple(sorted(present)) != sides_of(str(key))}
 
 
 @_stage(
@@ -176,8 +176,8 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
         Check(
             "clips_present",
             "Every clip exists and has its digest (checked while the table is made; a damaged clip fails the step).",
-            lambda workspace, key, made: sorted(
-                (named := {row.clip for row in made.rows(ITEMS)}) - workspace.sizes(named).keys()
+            lambda workspace, key, output: sorted(
+                (named := {row.clip for row in output.rows(ITEMS)}) - workspace.sizes(named).keys()
             ),
         ),
     ],

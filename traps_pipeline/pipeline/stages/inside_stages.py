@@ -71,7 +71,7 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
     code="2",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
-    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
+    wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return the probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
@@ -153,7 +153,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     tables.PATCHING,
     parents=[of(probe_items, EVERY, need="some"), patching_settings],
-    wants=lambda wanted, key: wanted.patched_prompt == Extraction.parse(key).prompt,
+    wants=lambda study, key: study.patched_prompt == Extraction.parse(key).prompt,
     kinds=["parquet", "pytorch"],
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:

@@ -139,7 +139,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
     takes=RunResources(memory_gb=1.0, each_gb=0.5),
-    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
+    wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 def probes(workspace: Workspace, key: str) -> StageOutput:

@@ -45,20 +45,27 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
     """Return findings, leaderboard, figures and tables beside the paper's on one page that opens from disk; every
     number is a link into the explorer. A table or figure is made again only when a table that it reads changed."""
     from traps_pipeline.report.cards import Card, Sources
-    from traps_pipeline.report.publish import MARKDOWN, report_files, report_parts
+    from traps_pipeline.report.publish import MARKDOWN, PAPER, report_files, report_parts
 
     sources = Sources(workspace)
     parts = report_parts(sources)
     pieces = [
-        Piece(f"{p.chapter}/{p.name}", lambda p=p: p.make().data, (*p.reads, "published"), p.inputs) for p in parts
+        Piece(
+            f"{p.chapter}/{p.name}",
+            lambda p=p: p.make().data,
+            (*p.reads, "published"),
+            p.inputs,
+            is_shared=p.chapter == PAPER,
+        )
+        for p in parts
     ]
     contents, remade = make_pieces(workspace, "report_page", code_of(GROUP), pieces)
     files = report_files(sources.study, [(name.partition("/")[0], Card.read(data)) for name, data in contents.items()])
-    shown = {
+    figures = {
         "made again": f"{len(remade)} of {len(pieces)}: {', '.join(remade[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
-    return StageOutput(files, shown=shown)
+    return StageOutput(files, shown=figures)
 
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))

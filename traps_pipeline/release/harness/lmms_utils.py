@@ -31,12 +31,12 @@ def doc_to_target(doc: dict[str, Any]) -> str:
 
 
 def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> str:
-    """For models that take one text: the system prompt stands before the question."""
+    """Return one text, for models that take no more: the system prompt, then the question."""
     return f"{prompt(regime)}\n\n{doc['question']}"
 
 
 def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> list[dict[str, Any]]:
-    """For chat models: system prompt, then the clip and the question, nothing else."""
+    """Return the messages for a chat model: system prompt, then the clip and the question, nothing else."""
     visuals = doc_to_visual(doc)
     kind = "video" if isinstance(visuals[0], str) else "image"
     content = [{"type": kind, "url": one} for one in visuals]

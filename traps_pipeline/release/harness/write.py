@@ -156,7 +156,10 @@ traps_harness = ["*.json", "*.jsonl", "media/**"]
 
 
 def _lmms(target: Path, about: Mapping[str, Any]) -> None:
-    """A task a regime. lmms-eval takes the path of its items as it stands in the YAML, so the folder is not moved."""
+    """Write a task for each regime.
+
+    lmms-eval takes the path of its items as it stands in the YAML, so the folder is not moved.
+    """
     write_text(target / LMMS / "utils.py", copied((_CODE / "release/harness/lmms_utils.py").read_text("utf-8")))
     parameters = {"max_new_tokens": about["parameters"]["max_tokens"], "do_sample": True}
     parameters |= {name: about["parameters"][name] for name in ("temperature", "top_p")}

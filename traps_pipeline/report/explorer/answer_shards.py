@@ -105,8 +105,8 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     judged = verdicts["key"].to_numpy()
     at = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
     at[judged] = np.arange(len(judged))
-    found = at[keys]
-    judged_as = pc.take(verdicts["outcome"], pa.array(found, mask=found < 0))
+    places = at[keys]
+    judged_as = pc.take(verdicts["outcome"], pa.array(places, mask=places < 0))
     is_unread = pc.fill_null(pc.equal(judged_as, UNREAD), False)
     outcomes, outcome = _coded(pc.if_else(is_unread, judged_as, responses["outcome"]))
     epochs, epoch = _coded(responses["epoch"])
@@ -115,9 +115,9 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
         "evaluation": keys % max(len(evaluations), 1),
         "outcome": outcome,
         "epoch": epoch,
-        "abstained": _decision(verdicts["abstained"], found),
-        "correct": _decision(verdicts["correct"], found),
-        "unanimous": _decision(verdicts["unanimous"], found) == YES,
+        "abstained": _decision(verdicts["abstained"], places),
+        "correct": _decision(verdicts["correct"], places),
+        "unanimous": _decision(verdicts["unanimous"], places) == YES,
     }
     votes = _keyed(_of_items(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
     at[:] = -1
@@ -147,8 +147,8 @@ def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items:
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
     """Return those that gave answers, by model, regime (in the benchmark's order) and run."""
     distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
-    found = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
-    return sorted(found, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
+    evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
+    return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:

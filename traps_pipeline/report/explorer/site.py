@@ -93,22 +93,22 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Wri
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
     existing = {name for name in names if workspace.resolve(name).is_file()}
-    written = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
+    summary = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
     page = workspace.reports / REPORT
     report = {REPORT: workspace.store.here(page).read_bytes()} if workspace.store.has(page) else {}
     files = report | _files(workspace, answers, scenarios, existing, "", report=bool(report))
     for name in sorted(existing):
-        written.clip_bytes += _put_clip(workspace.resolve(name), folder / name)
-        written.clips += 1
+        summary.clip_bytes += _put_clip(workspace.resolve(name), folder / name)
+        summary.clips += 1
     manifest = json.dumps(sorted([*files, *existing]), indent=0).encode()
     write_bytes(folder / MANIFEST, json.dumps(sorted({*files, *existing, *former}), indent=0).encode())
     for name, content in files.items():  # the index comes last
         write_bytes(folder / name, content)
-        written.files, written.bytes = written.files + 1, written.bytes + len(content)
+        summary.files, summary.bytes = summary.files + 1, summary.bytes + len(content)
     for name in sorted(former - {*files, *existing}):
         (folder / name).unlink(missing_ok=True)
     write_bytes(folder / MANIFEST, manifest)
-    return written
+    return summary
 
 
 def _files(
@@ -173,8 +173,8 @@ def _contents(
     items["clip"] = [clip if clip in clips else None for clip in items["clip"]]
     contents["items"] = {"items": parquet_text(pa.Table.from_pandas(items, preserve_index=False))}
     contents["decisions"] = {"decisions": parquet_text(answers.decisions)}
-    shown = [{**row, "twin_clip": row["twin_clip"] if row["twin_clip"] in clips else None} for row in scenarios]
-    contents["scenarios"] = {"scenarios": shown}
+    rows = [{**row, "twin_clip": row["twin_clip"] if row["twin_clip"] in clips else None} for row in scenarios]
+    contents["scenarios"] = {"scenarios": rows}
     for table in (CONTRASTS, REGIME_TESTS):
         contents[table.name] = {table.name: parquet_text(workspace.tables.read_arrow(table))}
     return {"study": _study(workspace, answers, shards, bool(clips)), **contents}
@@ -257,12 +257,12 @@ def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> 
 
 def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the version of a site: a digest of all its data and of its script."""
-    found = hashlib.sha256(script().encode())
+    digest = hashlib.sha256(script().encode())
     for name, content in contents.items():
         for key, value in content.items():
             text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-            found.update(f"\0{name}\0{key}\0{text}".encode())
-    return found.hexdigest()[:16]
+            digest.update(f"\0{name}\0{key}\0{text}".encode())
+    return digest.hexdigest()[:16]
 
 
 # --- page -------------------------------------------------------------------------------------------------------------

@@ -68,8 +68,8 @@ def probe_baselines(results: Results) -> Figure:
 def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
     order = [(s, t) for s in DATASETS for t in sorted(DATASETS, key=lambda t: (t != s, DATASETS.index(t)))]
     by_pair = {(row["source"], row["target"]): row for row in rows.to_dict("records")}
-    shown = [pair for pair in order if pair in by_pair]
-    for x, pair in enumerate(shown):
+    pairs = [pair for pair in order if pair in by_pair]
+    for x, pair in enumerate(pairs):
         row = by_pair[pair]
         if row["noise_spread"] == row["noise_spread"]:
             low, high = row["noise"] - 2 * row["noise_spread"], row["noise"] + 2 * row["noise_spread"]
@@ -79,10 +79,10 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
         ax.plot([x - 0.32, x - 0.32], [row["low"], row["high"]], color=INK, linewidth=0.8)
         ax.plot(x - 0.32, row["value"], marker="o", color=INK, markersize=3.5)
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
-    names = ["itself" if s == t else f"{SHORT[s]}→{SHORT[t]}" for s, t in shown]
-    names = [SHORT[s] if s == t else n for n, (s, t) in zip(names, shown, strict=True)]
-    marked = [f"{name} {by_pair[pair]['mark']}".strip() for name, pair in zip(names, shown, strict=True)]
-    ax.set_xticks(range(len(shown)), marked)
+    names = ["itself" if s == t else f"{SHORT[s]}→{SHORT[t]}" for s, t in pairs]
+    names = [SHORT[s] if s == t else n for n, (s, t) in zip(names, pairs, strict=True)]
+    marked = [f"{name} {by_pair[pair]['mark']}".strip() for name, pair in zip(names, pairs, strict=True)]
+    ax.set_xticks(range(len(pairs)), marked)
     ax.tick_params(axis="x", labelrotation=60, length=0)
     ax.set_ylim(-0.03, 1.05)
 
@@ -108,8 +108,8 @@ def gate_arrows(results: Results) -> Figure:
             _arrows(ax, part, colour)
             ax.set_title(f"{regime}, {plain(' and '.join(dict.fromkeys(part['model'])))[:30]}", size=7.5)
         _risk(panels[-1], results.risk_coverage, regimes[-1], colour)
-        shown = [name for name in _FEATURES if name in set(rows["features"])]
-        handles = [legend_key(f"gate on {name}", colour[name], "o", "-") for name in shown]
+        features = [name for name in _FEATURES if name in set(rows["features"])]
+        handles = [legend_key(f"gate on {name}", colour[name], "o", "-") for name in features]
         handles += [legend_key("no gate", INK, "o", size=6, markerfacecolor="white")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
@@ -266,14 +266,14 @@ def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
         ax.plot(void["gaps"], 100 * void["abstention"].astype(float), color=ink, linestyle=line, marker=marker,
                 markersize=3.2, linewidth=1.0, clip_on=False)  # fmt: skip
         for place, null in enumerate(NULLS):
-            drawn = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
-            if not len(drawn):
+            nulls = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
+            if not len(nulls):
                 continue
-            top = float(drawn["gaps"].iloc[0])
+            top = float(nulls["gaps"].iloc[0])
             at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
-            counts = (100 * drawn["abstention"].astype(float)).round(6).value_counts()
+            counts = (100 * nulls["abstention"].astype(float)).round(6).value_counts()
             ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
                        marker=marker, linewidths=0, clip_on=False)  # fmt: skip
             ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
-            given = [dose for dose in sorted(set(void["gaps"])) if dose == 0 or dose >= top / 4]
-            ax.set_xticks([*given, 1.39 * top, 1.94 * top], [*(f"{dose:g}" for dose in given), "+", "−"])
+            doses = [dose for dose in sorted(set(void["gaps"])) if dose == 0 or dose >= top / 4]
+            ax.set_xticks([*doses, 1.39 * top, 1.94 * top], [*(f"{dose:g}" for dose in doses), "+", "−"])

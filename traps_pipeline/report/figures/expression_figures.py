@@ -49,9 +49,9 @@ def states_and_output(results: Results) -> Figure:
         for ax in axes[-1]:
             ax.set_xlabel("output: log-odds of abstaining", size=7)
         handles = [
-            legend_key(f"{side}, {said}", colour, "o", markerfacecolor=face or colour)
+            legend_key(f"{side}, {word}", colour, "o", markerfacecolor=face or colour)
             for side, colour in (("void", VOID), ("control", CONTROL))
-            for said, face in (("answered", ""), ("abstained", "white"))
+            for word, face in (("answered", ""), ("abstained", "white"))
         ]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure

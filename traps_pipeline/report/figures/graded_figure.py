@@ -31,7 +31,7 @@ def graded(results: Results) -> Figure:
     if not len(rows):
         raise NotRun(WHY)
     models, regimes = list(dict.fromkeys(rows["model"])), sorted(set(rows["regime"]), key=REGIMES.index)
-    lines = {regime: _LINES[k % len(_LINES)] for k, regime in enumerate(regimes)}
+    lines: dict[str, Any] = {regime: _LINES[k % len(_LINES)] for k, regime in enumerate(regimes)}
     states = set(rows.loc[rows["stated"].notna(), "regime"])
     with figure_style():
         figure = new_figure(PAGE_IN, 2.6 + 0.03 * (len(models) + len(regimes)))

@@ -166,11 +166,18 @@ def shortcut_figure(table: pd.DataFrame) -> Figure:
         for k, cue in enumerate(cues):
             rows = table.loc[table["cue"] == cue].set_index("dataset")
             at = [datasets.index(str(name)) + 0.17 * (k - (len(cues) - 1) / 2) for name in rows.index]
+            share, half = rows["accuracy"].to_numpy(float), rows["half_width"].to_numpy(float)
+            ends = np.minimum(half, share), np.minimum(half, 1 - share)  # no share is below 0 or above 1
             axes.errorbar(
-                rows["accuracy"], at, xerr=rows["half_width"], fmt=MARKERS[k], color=COLOURS[k], markersize=4,
+                share, at, xerr=np.vstack(ends), fmt=MARKERS[k], color=COLOURS[k], markersize=4,
                 linestyle="none", linewidth=0.8, label=cue, clip_on=False, zorder=3,
             )  # fmt: skip
-        axes.set(xlim=(0.38, 1.02), ylim=(len(datasets) - 0.5, -0.5), xlabel="share of sides predicted correctly")
+        least = min([0.4, *(table["accuracy"] - table["half_width"])])
+        axes.set(
+            xlim=(max(0.0, least) - 0.02, 1.02),
+            ylim=(len(datasets) - 0.5, -0.5),
+            xlabel="share of sides predicted correctly",
+        )
         axes.set_yticks(range(len(datasets)), [TITLES[name] for name in datasets])
         if cues:
             columns = len(cues)

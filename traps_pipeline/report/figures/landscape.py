@@ -165,13 +165,13 @@ def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> l
     at = {row["model"]: (float(row["j"]), float(row["acc"])) for row in points.to_dict("records")}
     look, labels = looks(at), []
     for chain in chains:
-        shown = [model for model in chain if model in at and np.isfinite(at[model]).all()]
-        for start, end in pairwise(shown):
+        present = [model for model in chain if model in at and np.isfinite(at[model]).all()]
+        for start, end in pairwise(present):
             axes.plot(*np.array([at[start], at[end]]).T, linewidth=0, zorder=LINES)
             arrow(axes, at[start], at[end], look[end][0])
-        for k, model in enumerate(shown):
+        for k, model in enumerate(present):
             colour, marker = look[model]
-            face = colour if k == len(shown) - 1 else "white"  # filled: thinks most
+            face = colour if k == len(present) - 1 else "white"  # filled: thinks most
             axes.scatter(*at[model], s=20, marker=marker, facecolors=face, edgecolors=colour, linewidths=0.9, zorder=4)
             labels.append(Label(*at[model], short(model), colour))
     return labels

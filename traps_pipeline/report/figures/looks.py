@@ -80,7 +80,7 @@ def legend_key(label: str, colour: str, marker: str = "", line: Any = "none", si
 
 
 def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str) -> None:
-    """A thin arrow between two markers' rims."""
+    """Draw a thin arrow between two markers' rims."""
     style = {"arrowstyle": "-|>,head_width=0.12,head_length=0.25", "color": colour, "linewidth": 0.8}
     style |= {"shrinkA": 2.5, "shrinkB": 2.5, "mutation_scale": 10}
     axes.annotate("", end, start, arrowprops=style, zorder=2.5, annotation_clip=False)

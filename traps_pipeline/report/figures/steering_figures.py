@@ -37,7 +37,7 @@ SETS = {"transfer": "transfer", "within_domain": "within"}
 
 
 def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) -> None:
-    """Sources by colour and line, targets by marker, below the panels."""
+    """Draw the legend below the panels: sources by colour and line, targets by marker."""
     sources = [legend_key(f"from {TITLES[d].lower()}", colours[d], line=LINE[d]) for d in DATASETS]
     targets = [legend_key(f"to {TITLES[d].lower()}", SOFT, MARKER[d], size=3.5) for d in DATASETS]
     handles = [*sources, *targets, *more]

@@ -68,7 +68,7 @@ def beside(results: Results) -> pd.DataFrame:
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
-    """As `beside`, on the items that only look like voids, by probes of the datasets of their taxonomy."""
+    """Return what `beside` does for items that only look like voids, by probes of the datasets of their taxonomy."""
     probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
@@ -76,8 +76,8 @@ def look_alikes(results: Results) -> pd.DataFrame:
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
     probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
-    kept = probe[[*AT, "layer", "value", "low", "high", "n_voids", "n_controls"]]
-    table = kept.merge(by_features(results), on=AT, how="left")
+    states = probe[[*AT, "layer", "value", "low", "high", "n_voids", "n_controls"]]
+    table = states.merge(by_features(results), on=AT, how="left")
     return table.assign(mark=few(table, "n_voids", "n_controls"))
 
 

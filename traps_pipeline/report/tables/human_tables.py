@@ -93,8 +93,8 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
 
 def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
     """Return the rows with `FIELD_shown`: the figure and its interval as printed."""
-    shown = {f"{field}_shown": [_shown(row, field) for row in rows.to_dict("records")] for field in fields}
-    return rows.assign(**shown)
+    columns = {f"{field}_shown": [_shown(row, field) for row in rows.to_dict("records")] for field in fields}
+    return rows.assign(**columns)
 
 
 def _shown(row: Mapping[Any, Any], field: str) -> str:

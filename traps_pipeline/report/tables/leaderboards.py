@@ -52,8 +52,8 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
     columns = [MODEL, REGIME, PECS, *SHARES, J]
     notes = [epochs(results.cells), "equal-weight mean over the four datasets", *marks(rows)]
     if results.is_study:
-        shown = rows.to_dict("records")
-        rows = rows.assign(ci=[interval(row) for row in shown], ranks=[ranks(row) for row in shown])
+        records = rows.to_dict("records")
+        rows = rows.assign(ci=[interval(row) for row in records], ranks=[ranks(row) for row in records])
         columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
         notes.append("rank by PECS within the regime; 2–4: paired contrasts (Holm) do not separate these ranks")
         printed = published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})

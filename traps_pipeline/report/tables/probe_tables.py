@@ -77,8 +77,8 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
-        found = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
-        return {tuple(row[key] for key in KEYS): row for row in found.to_dict("records")}  # pyright: ignore[reportReturnType]
+        matching = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
+        return {tuple(row[key] for key in KEYS): row for row in matching.to_dict("records")}  # pyright: ignore[reportReturnType]
 
     asked = by_pair("transfer", rows["model"].notna())
     known = rows["value"].notna()
@@ -215,8 +215,8 @@ def _shared_controls(results: Results) -> list[str]:
     notes = [
         "cross-modality: both datasets have the same control items, so half of the target’s rows were used in the fit"
     ]
-    held = "held out: at the best layer, fitted without the scored scenario, beside the floor of noise under that split"
-    return notes + [held] * results.is_study
+    note = "held out: at the best layer, fitted without the scored scenario, beside the floor of noise under that split"
+    return notes + [note] * results.is_study
 
 
 # --- within a dataset, layers, centroids ------------------------------------------------------------------------------

@@ -16,16 +16,18 @@ function save(name, text) {
   setTimeout(() => URL.revokeObjectURL(address), 1000);
 }
 
-// Copy the address of this view; where the browser does not allow it, show it selected.
+// Copy the address of this view; where the browser does not allow it, show it selected until something else is done.
 async function copyAddress(button) {
   try {
     await navigator.clipboard.writeText(location.href);
-    button.textContent = "Copied";
   } catch {
     const field = h("input", { value: location.href, readonly: true, "aria-label": "address of this view" });
+    field.addEventListener("blur", () => field.replaceWith(button)); // the next view has another address
     button.replaceWith(field);
     field.select();
     return;
   }
-  setTimeout(() => (button.textContent = "Copy link"), 1500);
+  // An address of this disk opens nothing elsewhere.
+  button.textContent = location.protocol === "file:" ? "Copied: send this folder, too" : "Copied";
+  setTimeout(() => (button.textContent = "Copy link"), 2500);
 }

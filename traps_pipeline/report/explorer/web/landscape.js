@@ -34,7 +34,7 @@ async function landscapeView(route) {
         "p",
         { class: "lead" },
         "Right means telling voids from controls (J = AbsRec − FalseAbs), up means answering controls correctly. ",
-        "Curves join points of equal PECS = Acc × J. Bars are 95 % intervals.",
+        "Curves join points of equal PECS = Acc × J. Bars are 95 % intervals; the number behind a name is its PECS.",
       ),
       h(
         "div",

@@ -89,7 +89,7 @@ function pageLinks(route, page, pages) {
   );
 }
 
-// A table in a box that scrolls, with its CSV. columns: {title, number, sort}; rows: arrays of cells (nodes or texts); the first cell
+// A table in a box that scrolls, its CSV above it, where keys reach it before all links of the rows. columns: {title, number, sort}; rows: arrays of cells (nodes or texts); the first cell
 // heads its row. order: {by, down} and `sortBy` make headings sort. foot: rows below the others, which are never sorted.
 // data: rows of numbers for the CSV, where the cells are not all there is.
 /**
@@ -128,8 +128,7 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
     { class: "scroll", tabindex: "0", role: "region", "aria-label": caption || "table" },
     h(
       "table",
-      { "data-name": name },
-      caption ? h("caption", null, caption) : null,
+      { "data-name": name, "aria-label": caption || null },
       h("thead", null, h("tr", null, head)),
       h("tbody", null, rows.length ? rows.map(line) : empty),
       foot.length ? h("tfoot", null, foot.map(line)) : null,
@@ -137,7 +136,8 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
   );
   const file = `${name || (caption || "table").toLowerCase().replace(/[^a-z0-9]+/g, "_")}.csv`;
   const csv = () => save(file, data ? csvOfRows(data) : csvOfTable(whole));
-  return rows.length ? [whole, h("button", { type: "button", class: "save", onclick: csv }, "CSV")] : whole;
+  const button = rows.length ? h("button", { type: "button", class: "save", onclick: csv }, "CSV") : null;
+  return [caption || button ? h("div", { class: "caption" }, h("span", null, caption || ""), button) : null, whole];
 }
 
 function csvOfRows(rows) {

@@ -1,0 +1,71 @@
+"""A partition is stale when what it was made from is another now, is gone or is new, or when its formula changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.build.cells import row
+from traps_pipeline.judging.judging_rows import VERDICTS
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.lineage import Lineage, Status
+from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage.study import Asked, Study
+from traps_pipeline.storage.workspace import Workspace
+
+CELL = {"dataset": "chaotic", "model": "prior", "regime": "json", "run": 1}
+NAME = "verdicts/chaotic|prior__json__run1"
+
+
+def decide(workspace: Workspace, cell: dict[str, Any], *, abstained: bool) -> None:
+    """Write a verdict of a cell, as made from what is there."""
+    verdict = row(VERDICTS, **cell, item_id="chaotic:plinko-0001:void", abstained=abstained)
+    inputs = Lineage(workspace).inputs("verdicts", "{dataset}|{model}__{regime}__run{run}".format(**cell))
+    workspace.tables.write(VERDICTS, cell, [verdict], inputs, code=the_graph()["verdicts"].code)
+
+
+def score(workspace: Workspace, code: str) -> None:
+    """Write metrics, without rows, as made from what is there."""
+    inputs = Lineage(workspace).inputs("metrics", "chaotic")
+    assert NAME in inputs
+    workspace.tables.write(METRICS, {"dataset": "chaotic"}, [], inputs, code=code)
+
+
+def status(workspace: Workspace) -> Status:
+    return Lineage(workspace).status("metrics", "chaotic")
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Workspace:
+    """A study whose metrics are made from one cell."""
+    asked = Asked(models=["prior", "oracle"], regimes=["json"], runs=[1], datasets=["chaotic"])
+    workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"], experiments={"one": asked}))
+    decide(workspace, CELL, abstained=True)
+    score(workspace, the_graph()["metrics"].code)
+    assert status(workspace) == Status("fresh")
+    return workspace
+
+
+def test_other_verdicts_make_metrics_stale_and_the_same_ones_do_not(study: Workspace) -> None:
+    decide(study, CELL, abstained=True)
+    assert status(study) == Status("fresh")
+    decide(study, CELL, abstained=False)
+    assert status(study) == Status("stale", (f"{NAME} changed",))
+
+
+def test_a_cell_that_joins_makes_metrics_stale(study: Workspace) -> None:
+    decide(study, CELL | {"model": "oracle"}, abstained=True)
+    assert status(study) == Status("stale", (f"{NAME.replace('prior', 'oracle')} is new",))
+
+
+def test_a_table_that_is_gone_makes_metrics_stale(study: Workspace) -> None:
+    study.tables.path(VERDICTS, CELL).unlink()
+    assert status(study) == Status("stale", (f"{NAME} is gone",))
+
+
+def test_another_formula_makes_metrics_stale(study: Workspace) -> None:
+    score(study, "another")
+    [reason] = status(study).reasons
+    assert reason.startswith("its code has version ") and reason.endswith("it was made by version another")
