@@ -224,5 +224,9 @@ def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.report.tables.human_tables import said_by_people
     from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 
+    board = workspace.tables.read_all(LEADERBOARD)
+    if board.empty:
+        print("no leaderboard: no pairs were asked; the report has the tables of what was")
+        return
     notes = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
-    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST), notes))
+    print(leaderboard_text(board, workspace.tables.read_all(ROBUST), notes))

@@ -68,6 +68,11 @@ class StudyPartitions:
         """Arms and variations among them."""
         return [dataset for dataset in self.datasets if dataset in BESIDE]
 
+    @cached_property
+    def asks_pairs(self) -> bool:
+        """Whether any of them is of pairs: arms alone have no leaderboard."""
+        return bool({*self.datasets} & {*DATASETS})
+
     def _datasets(self, asked: Iterable[Asked]) -> list[str]:
         present = {dataset for category in self._present for dataset in all_datasets_of(category)}
         named = {dataset for experiment in asked for dataset in experiment.datasets}

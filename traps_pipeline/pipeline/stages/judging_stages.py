@@ -12,7 +12,7 @@ from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
-from traps_pipeline.pipeline.stages.scoring_stages import leaderboard
+from traps_pipeline.pipeline.stages.scoring_stages import asks_pairs, leaderboard
 from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.benchmark_tables import current_rows
@@ -54,7 +54,7 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
 _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 
-@_stage(AGREEMENT, parents=_VOTED)
+@_stage(AGREEMENT, parents=_VOTED, wants=asks_pairs)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return agreement of the panel and any two judges by dataset and task: unanimity, Fleiss, Cohen, Krippendorff."""
     from traps_pipeline.judging.agreement import agreement as rows_of
@@ -62,7 +62,7 @@ def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))
 
 
-@_stage(JUDGE_BIAS, parents=_VOTED)
+@_stage(JUDGE_BIAS, parents=_VOTED, wants=asks_pairs)
 def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return each judge's rate of yes against the panel's majority, per dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias as rows_of
@@ -70,7 +70,7 @@ def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
 
 
-@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard])
+@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=asks_pairs)
 def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return PECS by the votes of two judges, for each judge that is left out."""
     from traps_pipeline.scoring.leave_one_out import leave_one_out as rows_of

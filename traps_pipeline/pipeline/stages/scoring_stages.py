@@ -14,6 +14,7 @@ from traps_pipeline.pipeline.schemes import DATASET, by_dataset
 from traps_pipeline.pipeline.stage import is_declared, of, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import arms, items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts, votes
+from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.datasets import ARMS, DATASETS, GRADED
 from traps_pipeline.scoring.score_rows import (
     CONTRASTS,
@@ -32,6 +33,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _stage = partial(stage, group="scoring")
+
+
+def asks_pairs(partitions: StudyPartitions, key: str | None) -> bool:
+    """Return whether the study asks pairs."""
+    return partitions.asks_pairs
 
 
 def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
@@ -80,7 +86,7 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
 _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 
 
-@_stage(CONTRASTS, parents=_SCORED)
+@_stage(CONTRASTS, parents=_SCORED, wants=asks_pairs)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
     """Return paired differences between models and between regimes, with intervals and Holm's correction."""
     from traps_pipeline.scoring.bootstrap import resample
@@ -94,7 +100,7 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
     return StageOutput(table, shown=figures)
 
 
-@_stage(REGIME_TESTS, parents=_SCORED)
+@_stage(REGIME_TESTS, parents=_SCORED, wants=asks_pairs)
 def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
@@ -112,6 +118,7 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
             _none_of("standings.wrong_intervals", "intervals"),
         )
     ],
+    wants=asks_pairs,
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     """Return every model under every regime, per dataset and overall: means, spreads, 95 % intervals, ranks."""
@@ -134,6 +141,7 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
             "robust_rows_hold", "Figures lie in [0, 1] and in their intervals.", _none_of("robust.wrong_rows", "rows")
         )
     ],
+    wants=asks_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm;

@@ -1,0 +1,36 @@
+"""What a study wants follows from what its experiments ask."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.cli.run_commands import _print_results
+from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.storage.study import Asked, Study
+from traps_pipeline.storage.workspace import Workspace
+
+OF_PAIRS = {"contrasts", "regime_tests", "leaderboard", "robust", "agreement", "judge_bias", "leave_one_out"}
+
+
+@pytest.mark.parametrize(
+    ("datasets", "of_pairs"), [(("graded",), set()), (("graded", "decoy"), set()), (("chaotic", "graded"), OF_PAIRS)]
+)
+def test_a_study_without_pairs_wants_no_table_of_pairs(
+    tmp_path: Path, datasets: tuple[str, ...], of_pairs: set[str]
+) -> None:
+    asked = Asked(datasets=datasets, models=("oracle",), regimes=("priced",), runs=(1,))
+    study = Study(scenarios=["plinko-0001", "hidden_race-0001"], experiments={"mine": asked})
+    partitions = StudyPartitions(Workspace.create(tmp_path / "study", study))
+    wanted = {stage.name for stage in the_graph().stages if list(stage.wanted(partitions))}
+    assert wanted & OF_PAIRS == of_pairs
+    assert {"verdicts", "graded", "report_page"} <= wanted
+
+
+def test_a_run_without_pairs_ends_with_a_sentence_in_place_of_the_leaderboard(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _print_results(Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"])))
+    assert capsys.readouterr().out.startswith("no leaderboard: no pairs were asked")
