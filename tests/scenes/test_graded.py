@@ -31,6 +31,8 @@ def test_probabilities_are_of_the_futures_that_end_in_an_answer() -> None:
     assert graded.probabilities(Counter({None: 3})) == {}
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_graded_cut_shows_the_control_up_to_a_sampled_frame_and_knows_how_probable_each_answer_is() -> None:
     case = load("plinko-0001")
     scenario = Scenario.of_record(case.spec, case.qpos, case.twin)

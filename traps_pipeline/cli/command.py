@@ -21,8 +21,6 @@ from traps_pipeline.base.suggestions import did_you_mean, nearest
 from traps_pipeline.base.terminal import plain, wrapped
 
 if TYPE_CHECKING:
-    from _typeshed import SupportsWrite
-
     from traps_pipeline.pipeline.experiment import Experiment
     from traps_pipeline.servers.server import Listening
     from traps_pipeline.storage.place import Place
@@ -109,7 +107,7 @@ class Parser(argparse.ArgumentParser):
             message += did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3]))
         super().error(message)
 
-    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
+    def _print_message(self, message: str, file: Any = None) -> None:
         """Write a message. Raises BrokenPipeError, which `argparse` swallows from Python 3.11.3 on."""
         if message and (stream := file or sys.stderr):
             stream.write(message)

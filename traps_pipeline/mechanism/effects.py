@@ -44,8 +44,8 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
     parts: list[pd.DataFrame] = []
     for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *BESIDE))]:
         if value in rows:
-            means = rows.groupby([*keys, "side"], observed=True, dropna=False)[[value]].mean()
-            wide = cast("pd.DataFrame", means.unstack("side")[value])
+            means = rows.groupby([*keys, "side"], observed=True, dropna=False)[value].mean()
+            wide = cast("pd.Series", means).unstack("side")
             parts.append(wide.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
             columns += [f"control{suffix}", f"void{suffix}"]
     wide = parts[0].join(parts[1:]).reset_index().reindex(columns=pd.Index(columns))
