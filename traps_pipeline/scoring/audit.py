@@ -63,7 +63,7 @@ def audit() -> pd.DataFrame:
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     """Return the findings for a terminal: every claim, every difference, and counts of the rest; with `everything`,
     all."""
-    lines = []
+    lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
         lines.append(f"{group}: {len(rows)} statements: {counts}")
