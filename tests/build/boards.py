@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 import pandas as pd
 
-from traps_pipeline.protocol.datasets import SHORT
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.terms import TITLES
@@ -82,9 +82,12 @@ def tables(board):
     return [by_heading(rows) for rows in (text, markdown, html)]
 
 
+PECS_OF = {name: f"PECS {name.replace('_ill_posed', ' ill-posed')}" for name in DATASETS}  # headings in a terminal
+
+
 def by_heading(rows):
     """Rows as mappings, without deviations, bars and escapes."""
-    names = {f"PECS {TITLES[name].replace('-', NO_BREAK)}": f"PECS {short}" for name, short in SHORT.items()}
+    names = {f"PECS {TITLES[name].replace('-', NO_BREAK)}": PECS_OF[name] for name in DATASETS}
     headings = [names.get(heading, heading).replace("\\", "") for heading in rows[0]]
     found = []
     for row in rows[1:]:

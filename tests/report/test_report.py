@@ -6,14 +6,15 @@ import base64
 import hashlib
 import io
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.boards import board_of, board_row, tables
-from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from tests.build.boards import PECS_OF, board_of, board_row, tables
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.cards import EXPLORER, Card, data_address, explorer_address
 from traps_pipeline.report.contact_sheet import PAGE, pairs_figure, six_pairs, telling_times, whole_pairs
@@ -76,7 +77,7 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     # Acc 0.5, J 0.6 - 0.1 = 0.5, PECS 0.25; no dataset of its own is on the board.
     assert text[3].items() >= {
         "PECS": "0.250", "95 % CI": "[0.200, 0.300]", "Acc %": "50.0", "AbsRec %": "60.0", "FalseAbs %": "10.0",
-        "J": "0.500", **{f"PECS {short}": "–" for short in SHORT.values()}, "n": "1404", "Missing": "0",
+        "J": "0.500", **dict.fromkeys(PECS_OF.values(), "–"), "n": "1404", "Missing": "0",
     }.items()  # fmt: skip
     assert len({len(x) for x in lines[2:-2]}) == 1
     assert lines[-1] == "– not all four datasets evaluated, or nothing decided"
@@ -111,18 +112,18 @@ def cells_with_gaps(model="gaps"):
 def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
     board = board_of(*cells_with_gaps(), *(board_row("whole", dataset=d, shares=(1, 0, 1)) for d in BOARDS))
     assert entry(board, "whole").items() >= {
-        "PECS": "1.000", "PECS ch": "1.000", "n": "1404", "Missing": "0", "Refused": "0", "Empty": "0",
+        "PECS": "1.000", "PECS chaotic": "1.000", "n": "1404", "Missing": "0", "Refused": "0", "Empty": "0",
     }.items()  # fmt: skip
     assert entry(board, "gaps").items() >= {
-        "PECS oc": "0.250", "PECS ch": "0.250 ‡", "PECS ch_ip": "0.250", "n": "1404 ‡", "Missing": "61 †",
-        "Refused": "41", "Empty": "7", BOUNDS: "[0.200, 0.310]",
+        "PECS occlusion": "0.250", "PECS chaotic": "0.250 ‡", "PECS chaotic ill-posed": "0.250", "n": "1404 ‡",
+        "Missing": "61 †", "Refused": "41", "Empty": "7", BOUNDS: "[0.200, 0.310]",
     }.items()  # fmt: skip
 
 
 def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
     board = board_of(*cells_with_gaps())
     marked = {heading for heading, cell in entry(board, "gaps").items() if "‡" in cell}
-    assert marked == {"PECS", "PECS ch", "n"}
+    assert marked == {"PECS", "PECS chaotic", "n"}
     for said in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):
         assert "incomplete: fewer than 99 % of items answered" in said
     own = {d: report_html(board).split(f'id="leaderboard_{d}"')[1].split("</details>")[0] for d in DATASETS}
@@ -144,7 +145,7 @@ def test_a_cell_of_errors_alone_is_marked_at_its_dash():
     null = dict.fromkeys(("acc", "abs_rec", "false_abs", "j", "pecs", "pecs_ci_low", "pecs_ci_high"), np.nan)
     lost = {"n_missing": 8424, "n_errors": 8424, "answered": 0.0, "incomplete": True, "pecs_low": 0.0, "pecs_high": 1.0}
     row = entry(board_of(*(board_row("m", dataset=d, **null, **lost) for d in BOARDS)), "m")
-    assert [row[f"PECS{dataset}"] for dataset in ("", " oc", " oc_ip", " ch", " ch_ip")] == ["– ‡"] * 5
+    assert [row[heading] for heading in ("PECS", *PECS_OF.values())] == ["– ‡"] * 5
     assert [row[name] for name in ("95 % CI", "Acc %", "AbsRec %", "FalseAbs %", "J")] == ["–"] * 5
     assert (row["n"], row["Missing"], row[BOUNDS]) == ("1404 ‡", "8424 †", "[0.000, 1.000]")
 
@@ -154,7 +155,7 @@ def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
     board = board_of(part, board_row("weak"))
     assert tables(board)[0][-1]["Model"] == "part"
     assert entry(board, "part").items() >= {
-        "PECS": "–", "Acc %": "–", "PECS ch": "1.000 ‡", "n": "500 ‡", "Missing": "50 †",
+        "PECS": "–", "Acc %": "–", "PECS chaotic": "1.000 ‡", "n": "500 ‡", "Missing": "50 †",
     }.items()  # fmt: skip
     assert "not all four datasets evaluated" in report_html(board)
 
@@ -235,6 +236,16 @@ def test_no_two_labels_of_the_landscape_overlap(board):
     assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
     edge = figure.bbox
     assert all(b.x0 >= 0 and b.y0 >= 0 and b.x1 <= edge.x1 and b.y1 <= edge.y1 for b in boxes)
+
+
+def test_the_landscape_of_few_pairs_holds_its_wide_intervals():
+    ends = {"acc_ci_low": 0.01, "acc_ci_high": 0.8, "j_ci_low": -0.6, "j_ci_high": 0.6}
+    row = {"model": "mine", "regime": "guided", "acc": 0.25, "j": 0.0, "pecs": 0.0, "incomplete": False, **ends}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a layout that has no place for its axes
+        axes = landscape_figure(pd.DataFrame([row]), "Overall").axes[0]
+    assert axes.get_xlim()[0] <= -0.6 and axes.get_xlim()[1] >= 0.6
+    assert axes.get_ylim()[0] >= -0.05 and axes.get_ylim()[1] >= 0.8
 
 
 def test_the_landscape_reaches_left_to_the_inverse_oracle(board):

@@ -230,9 +230,8 @@ class Progress:
             parts += [f"{total.errors:,} error{'s' * (total.errors != 1)}"] if total.errors else []
             parts += [f"{total.retries:,} {'retry' if total.retries == 1 else 'retries'}"] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
-        if now.left_s is not None:
-            parts.append(f"{clock(now.left_s)} left")
-        return f"{now.name}: {', '.join(parts) or 'begins'}"
+        parts.append(f"{clock(now.seconds)} so far" if now.left_s is None else f"{clock(now.left_s)} left")
+        return f"{now.name}: {', '.join(parts)}"
 
     def spent(self) -> str:
         """Return the money spent and the budget, in words."""

@@ -68,8 +68,8 @@ class Job:
 
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
     """Return the arms and variations of a category's scenarios that some experiment of the study asks for."""
-    asked = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
-    return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in asked]
+    datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
+    return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in datasets]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:

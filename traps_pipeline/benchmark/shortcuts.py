@@ -52,8 +52,8 @@ def _cues(clips: pd.DataFrame, root: Path) -> Mapping[str, tuple[Features, Calla
         return lambda items: clips.loc[items["clip"], [column]].to_numpy(float)
 
     def first_frames(items: pd.DataFrame) -> np.ndarray:
-        seen = {path: _thumbnail(root / path) for path in items["clip"].unique()}
-        return np.stack([seen[path] for path in items["clip"]])
+        thumbnails = {path: _thumbnail(root / path) for path in items["clip"].unique()}
+        return np.stack([thumbnails[path] for path in items["clip"]])
 
     return {
         "question": (lambda items: items["question"].to_numpy(), _reader),

@@ -97,8 +97,8 @@ def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
 
 
 def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], epoch: str) -> Any:
-    asked = answer_request(workspace, entry, item, Evaluation(entry.id, REGIME, 1))
-    return replace(asked, about={**asked.about, "canary": epoch})
+    request = answer_request(workspace, entry, item, Evaluation(entry.id, REGIME, 1))
+    return replace(request, about={**request.about, "canary": epoch})
 
 
 def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:

@@ -81,8 +81,8 @@ def _studio() -> Studio:
 def requests_of(entry: Entry) -> dict[str, Request]:
     """Return a request of every form that a study sends: by regime for a model, by task and label for a judge."""
     if isinstance(entry, ModelEntry):
-        sent = _studio().prepare(entry.media) if entry.media else None
-        return {regime: question(entry, regime, _QUESTION, sent, {"regime": regime}) for regime in REGIMES}
+        media = _studio().prepare(entry.media) if entry.media else None
+        return {regime: question(entry, regime, _QUESTION, media, {"regime": regime}) for regime in REGIMES}
     assert isinstance(entry, JudgeEntry)
     cell, item = Cell("occlusion", Evaluation("oracle", "standard", 1)), {"item_id": "none", "question": _QUESTION}
     known = item | {"ground_truth": "yes"}

@@ -63,9 +63,9 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
         workspace = workspace.allow(panel=judged.panel, judged_by_rules=judged.judged_by_rules)
     if experiment.mechanism is not None and workspace.study.mechanism is None:
         workspace = workspace.allow(mechanism=experiment.mechanism)
-    asked = workspace.study.experiments | {experiment.name: experiment.asked}
-    if asked != workspace.study.experiments:
-        workspace = workspace.allow(experiments=asked)
+    experiments = workspace.study.experiments | {experiment.name: experiment.asked}
+    if experiments != workspace.study.experiments:
+        workspace = workspace.allow(experiments=experiments)
     entered(workspace)
     keep(workspace)
     if not (workspace.dagster_home / "dagster.yaml").exists():

@@ -57,7 +57,7 @@ def plan(arguments: argparse.Namespace) -> int:
     where = place if workspace else "a new workspace"
     print(wrapped(f"{experiment.name} in {where}: calls wanted, known (in the ledger), new"))
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
-    if planned.labels is not None:
+    if planned.labels is not None and planned.labels.wanted:
         rows["confabulation labels"] = (Count(), planned.labels)
     for counts in rows.values():
         for sum_, count in zip(total, counts, strict=True):

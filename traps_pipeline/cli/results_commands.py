@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.terminal import text_table, wrapped
 from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, print_json
 
 
@@ -63,7 +63,7 @@ def audit_published(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(findings)
     else:
-        print(audit_text(findings, arguments.all))
+        print(wrapped(audit_text(findings, arguments.all)))
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(findings))
         print(f"every finding: {arguments.csv}", file=sys.stderr)

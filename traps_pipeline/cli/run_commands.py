@@ -146,8 +146,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _print_work(report: RunReport, *, is_inside: bool) -> None:
     from traps_pipeline.base.progress import clock
 
-    asked, voted = report.tally("responses"), report.tally("votes")
-    print(f"\n{asked.asked} answers asked ({asked.cached} from the ledger)")
+    responses, voted = report.tally("responses"), report.tally("votes")
+    print(f"\n{responses.asked} answers asked ({responses.cached} from the ledger)")
     print(f"{voted.asked} votes asked ({voted.cached} from the ledger)")
     print(f"{report.frames} frames rendered, {clock(report.seconds)} min")
     if is_inside:
@@ -188,8 +188,8 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
     """Return the workspace with the budgets of the command, else the experiment. Raises TrapsError for a wrong one."""
-    stated = {name: getattr(experiment, name) for name in MONEY}
-    money: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    fields = {name: getattr(experiment, name) for name in MONEY}
+    money: dict[str, Any] = {name: value for name, value in fields.items() if value is not None}
     if arguments.allow_unknown_prices:
         money["allow_unknown_prices"] = True
     for text in arguments.budget_usd:

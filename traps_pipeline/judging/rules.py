@@ -118,7 +118,7 @@ def _in_text(text: str, question: str) -> Statement | None:
     may stand.
     """
     sentences = [part for part in _SENTENCE_END.split(_MARKUP.sub("", text).strip()) if part]
-    asked, last = f" {_words(question)} ", len(sentences) - 1
+    wording, last = f" {_words(question)} ", len(sentences) - 1
     statements = dict[int, Statement | None]()
     for place, sentence in enumerate(sentences):
         if announced := _ANNOUNCED.fullmatch(sentence):
@@ -128,7 +128,7 @@ def _in_text(text: str, question: str) -> Statement | None:
             statements[place] = _in_words(sentence, question)
         elif _in_words(sentence, question) == ABSTENTION:
             before = _words(" ".join(sentences[:last])).split() if place == last else []
-            choices = [w for w in before if _LABEL.fullmatch(w) or f" {w} or " in asked or f" or {w} " in asked]
+            choices = [w for w in before if _LABEL.fullmatch(w) or f" {w} or " in wording or f" or {w} " in wording]
             statements[place] = None if choices else ABSTENTION
     explained = last > 0 and statements.get(0, ABSTENTION) != ABSTENTION and _EXPLAINS.match(sentences[1])
     agree = len({*statements.values()}) == 1 and (last in statements or explained)

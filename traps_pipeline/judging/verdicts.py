@@ -77,8 +77,8 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
 def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> pd.arrays.BooleanArray:
     """Return the majority on whether each answer rejects the premise, (rows,); null without one, or where nobody was
     asked."""
-    asked = votes.loc[votes["task"].eq("abstention") & votes["rejects_premise"].notna(), [*ANSWER, "rejects_premise"]]
-    yes = asked.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
+    marks = votes.loc[votes["task"].eq("abstention") & votes["rejects_premise"].notna(), [*ANSWER, "rejects_premise"]]
+    yes = marks.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
     counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)
     rejects, accepts = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
     return pd.arrays.BooleanArray(rejects > n_judges / 2, np.maximum(rejects, accepts) <= n_judges / 2)

@@ -114,25 +114,25 @@ def raw_features(
     questions = [question for rows in items.values() for question in rows["question"]]
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
     clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
-    seen = {clip: _seen(resolve(clip), spec) for clip in sorted(clips)}
-    most = max(len(frames) for frames, _, _ in seen.values())
+    clip_frames = {clip: _seen(resolve(clip), spec) for clip in sorted(clips)}
+    most = max(len(frames) for frames, _, _ in clip_frames.values())
 
     def pixels(clip: str) -> np.ndarray:
-        frames = seen[clip][0]
+        frames = clip_frames[clip][0]
         missing = np.repeat(frames.mean(axis=0, keepdims=True), most - len(frames), axis=0)
         return np.concatenate([frames, missing]).ravel()
 
     def stamps(row: Mapping[str, Any]) -> list[float]:
-        times = seen[row["times_clip"] or row["clip"]][1]
-        return [len(seen[row["clip"]][1]), times[0], times.mean(), times[-1]]
+        times = clip_frames[row["times_clip"] or row["clip"]][1]
+        return [len(clip_frames[row["clip"]][1]), times[0], times.mean(), times[-1]]
 
     features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
         shown = records(rows)
         features["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
-        features["first frame"][dataset] = np.stack([seen[row["clip"]][0][0].ravel() for row in shown])
+        features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown])
         features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown])
-        features["length"][dataset] = np.array([[seen[row["clip"]][2]] for row in shown])
+        features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown])
         features["time stamps"][dataset] = np.array([stamps(row) for row in shown])
     return dict(features)
 

@@ -161,8 +161,8 @@ def _tick(what: str, before: int, total: int, done: int) -> None:
 
 def _look_for(folder: Path, known: dict[str, _Place]) -> None:
     """Add what is in shards that were not looked at."""
-    seen = {shard for shard, _, _ in known.values()}
-    for shard, table in _shards(folder, seen):
+    names = {shard for shard, _, _ in known.values()}
+    for shard, table in _shards(folder, names):
         for row, (key, device) in enumerate(zip(table["key"], table["device"], strict=True)):
             known[key] = (shard, row, device)
 

@@ -112,8 +112,8 @@ class Pairs:
         self._names = seeded_order(sorted(set(items["scenario_id"])), seed)[: settings.pairs]
         self._parts = dict[tuple[str, str, str], Mapping[str, np.ndarray]]()
         self._side = lru_cache(PROMPTS_KEPT)(self._make_side)
-        asked = items[["item_id", "media_digest", "question"]].to_numpy(str).tolist()
-        made_of = [extraction_version(workspace, extraction), sorted(asked), self._names, settings.sites]
+        questions = items[["item_id", "media_digest", "question"]].to_numpy(str).tolist()
+        made_of = [extraction_version(workspace, extraction), sorted(questions), self._names, settings.sites]
         self._version = digest(made_of)[:16]
         self._folder = workspace.root / "patching" / extraction.model / extraction.prompt / dataset
 

@@ -258,14 +258,14 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: So
         train, test = folds != fold, folds == fold
         states = np.asarray(split.states[train], float)
         mean, scale = standardiser(states)
-        seen, unseen = (states - mean) / scale, (split.states[test] - mean) / scale
+        train_states, unseen = (states - mean) / scale, (split.states[test] - mean) / scale
         if solver == "sklearn":
-            fitted = [_reference(seen, column, PENALTY) for column in labels[train].T]
+            fitted = [_reference(train_states, column, PENALTY) for column in labels[train].T]
             scores = np.column_stack([unseen @ weights for weights, _ in fitted])
         else:
-            gram = seen @ seen.T
+            gram = train_states @ train_states.T
             duals = np.column_stack([solve_gram(gram, column)[0] for column in labels[train].T])
-            scores = unseen @ (seen.T @ duals)
+            scores = unseen @ (train_states.T @ duals)
         areas.append([auroc(labels[test, k], scores[:, k]) for k in range(labels.shape[1])])
     return np.mean(areas, axis=0)
 

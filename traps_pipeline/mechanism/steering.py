@@ -225,7 +225,7 @@ def steered_request(
     """Return the call for one steered answer: the full benchmark prompt, greedy, in the precision of extraction."""
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
-    sent = workspace.media.prepare(clip, item["media_digest"], entry.media)
+    media = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
     if strength.alpha:
         signed = strength.signed(item["side"])
@@ -238,8 +238,8 @@ def steered_request(
         user=item["question"],
         about={"item_id": shared_item(item), "model": entry.id, "regime": cell.evaluation.regime},
         media=clip,
-        sent=sent,
-        media_digest=sent.sha256,
+        sent=media,
+        media_digest=media.sha256,
     )
 
 

@@ -47,7 +47,7 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
     """
     clip, dataset = workspace.resolve(item["clip"]), dataset_of(item["item_id"])
     spec = framed(entry.media, dataset) if entry.media else None
-    sent = workspace.media.prepare(clip, item["media_digest"], spec) if spec else None
+    media = workspace.media.prepare(clip, item["media_digest"], spec) if spec else None
     return Request(
         participant=entry.id,
         endpoint=entry.endpoint,
@@ -56,8 +56,8 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
         user=item["question"],
         about={"item_id": item["item_id"], "model": entry.id, "regime": evaluation.regime, "run": evaluation.run},
         media=clip,
-        sent=sent,
-        media_digest=sent.sha256 if sent else item["media_digest"],
+        sent=media,
+        media_digest=media.sha256 if media else item["media_digest"],
         secret=_secret(entry, item),
     )
 

@@ -268,7 +268,7 @@ class ApiBackend:
         """Say once for each kind what the provider said, without the key. passes: whether another try may help."""
         if kind not in self._told:
             self._told.add(kind)
-            message = redact(" ".join(message.split()))  # before it is cut
+            message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
             happened = _HAPPENED.get(kind, "a call failed")
             again = "; a run tries again" if passes else ""
             progress.current().note(f"{self._entry.id}: {happened}{again} ({kind}: {plain(message)[:300]})")

@@ -164,11 +164,11 @@ class _Asking:
         queues: dict[str, deque[Request]] = {}
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
-        asked = [(self.work.participants[name], queue) for name, queue in queues.items()]
+        queue_of = [(self.work.participants[name], queue) for name, queue in queues.items()]
         syncing = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
-                for participant, queue in asked:
+                for participant, queue in queue_of:
                     for _ in range(min(participant.entry.limits.concurrency, len(queue))):
                         group.create_task(self.worker(participant, queue))
         finally:

@@ -143,11 +143,11 @@ def retry_after_s(headers: Mapping[str, str], error: ProviderError | None = None
     milliseconds = _seconds(named.get("retry-after-ms"), now)
     if milliseconds is not None:
         return milliseconds / 1000
-    stated = _seconds(named.get("retry-after"), now)
-    if stated is None and error is not None:
+    delay_s = _seconds(named.get("retry-after"), now)
+    if delay_s is None and error is not None:
         delays = [_seconds(one.get("retryDelay"), now) for one in error.details]
-        stated = next((delay for delay in delays if delay is not None), None)
-    return _reset_s(named, now) if stated is None else stated
+        delay_s = next((delay for delay in delays if delay is not None), None)
+    return _reset_s(named, now) if delay_s is None else delay_s
 
 
 def _reset_s(named: Mapping[str, str], now: float) -> float | None:

@@ -98,13 +98,15 @@ def _whole(
         del counts[str(total)]
     if completion not in counts or not all(map(_is_count, counts.values())):
         return None
-    asked = counts[prompt] + sum(counts.get(name, 0) for name, of_answer in apart.items() if not of_answer)
+    read_tokens = counts[prompt] + sum(counts.get(name, 0) for name, of_answer in apart.items() if not of_answer)
     completion_tokens = counts[completion] + sum(counts.get(name, 0) for name, of_answer in apart.items() if of_answer)
     if total in counts:
         if counts[total] < counts[prompt] + counts[completion]:
             return None
-        completion_tokens = max(completion_tokens, counts[total] - asked)  # some tell their reasoning in the sum alone
-    return Usage(asked, completion_tokens, _reasoning(fields, completion_tokens))
+        completion_tokens = max(
+            completion_tokens, counts[total] - read_tokens
+        )  # some tell their reasoning in the sum alone
+    return Usage(read_tokens, completion_tokens, _reasoning(fields, completion_tokens))
 
 
 def _reasoning(fields: Mapping[str, Any], most: int) -> int | None:

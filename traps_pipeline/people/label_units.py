@@ -108,8 +108,8 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     )
     rows = decided.merge(texts, on=_ANSWER, validate="one_to_one").merge(items, on="item_id", validate="many_to_one")
     panel = rows[decision].astype(bool)
-    asked = ["question"] if task == "abstention" else ["question", "ground_truth"]
-    answers = rows[[*_ANSWER, *asked, "text"]].itertuples(index=False, name=None)
+    fields = ["question"] if task == "abstention" else ["question", "ground_truth"]
+    answers = rows[[*_ANSWER, *fields, "text"]].itertuples(index=False, name=None)
     return rows.assign(
         unit=[_unit(task, *map(str, each)) for each in answers],
         group=rows["side"] + np.where(panel, " yes", " no"),

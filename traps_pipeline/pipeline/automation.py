@@ -135,11 +135,11 @@ def _requests(
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # What is outdated and stays so, with the same inputs, is tried once: it fails for a reason of its own.
-        seen = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
+        states = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
         for one in batches(block[0].scheme, keys):
             requests.append(
                 dg.RunRequest(
-                    digest([*one, seen])[:32],
+                    digest([*one, states])[:32],
                     partition_key=one[0] if one[0] == one[1] else None,
                     tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(one)},
                     asset_selection=[asset_key(stage.name) for stage in stages],

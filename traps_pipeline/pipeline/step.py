@@ -85,8 +85,8 @@ class _Step:
         self._maker = PartitionMaker(workspace, stage, self.history)
         self._inputs: dict[str | None, Mapping[str, str]] = {}  # of what is made, noted before anything is read
         keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
-        asked = {*stage.wanted(partitions)}
-        self._wanted, self._unwanted = [k for k in keys if k in asked], [k for k in keys if k not in asked]
+        wanted_keys = {*stage.wanted(partitions)}
+        self._wanted, self._unwanted = [k for k in keys if k in wanted_keys], [k for k in keys if k not in wanted_keys]
 
     def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
         """Count cells that no experiment asks for, which a range may hold, as done, so that a backfill ends."""

@@ -73,9 +73,9 @@ class StudyPartitions:
         """Whether any of them is of pairs: arms alone have no leaderboard."""
         return bool({*self.datasets} & {*DATASETS})
 
-    def _datasets(self, asked: Iterable[Asked]) -> list[str]:
+    def _datasets(self, experiments: Iterable[Asked]) -> list[str]:
         present = {dataset for category in self._present for dataset in all_datasets_of(category)}
-        named = {dataset for experiment in asked for dataset in experiment.datasets}
+        named = {dataset for experiment in experiments for dataset in experiment.datasets}
         return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in present & named]
 
     @cached_property
@@ -105,9 +105,9 @@ class StudyPartitions:
         if self._workspace is None:
             return [*DATASETS], None
         settings = self._workspace.study.mechanism
-        asked = [experiment for experiment in self._asked if experiment.mechanism]
-        datasets = [dataset for dataset in self._datasets(asked) if dataset in DATASETS]
-        return (datasets, settings) if asked and settings else None
+        experiments = [experiment for experiment in self._asked if experiment.mechanism]
+        datasets = [dataset for dataset in self._datasets(experiments) if dataset in DATASETS]
+        return (datasets, settings) if experiments and settings else None
 
     @cached_property
     def looks_inside(self) -> bool:
@@ -186,11 +186,11 @@ class StudyPartitions:
         return [SteeringCell.parse(f"{dataset}|{run}").key for dataset, run in product(datasets, self.steered)]
 
 
-def _evaluations(asked: Asked) -> list[Evaluation]:
+def _evaluations(experiment: Asked) -> list[Evaluation]:
     """Return those that a model has enough runs for; of no runs named, all that it has."""
     evaluations = []
-    for model in asked.models:
+    for model in experiment.models:
         available = range(1, get_model(model).runs + 1)
-        runs = [run for run in available if not asked.runs or run in asked.runs]
-        evaluations += [Evaluation(model, regime, run) for regime in asked.regimes for run in runs]
+        runs = [run for run in available if not experiment.runs or run in experiment.runs]
+        evaluations += [Evaluation(model, regime, run) for regime in experiment.regimes for run in runs]
     return evaluations

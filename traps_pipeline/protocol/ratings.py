@@ -64,13 +64,13 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
     votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
     rows, first = _grouped(votes, [*answer, "task"])
     values = np.full((len(first), len(seats)), INVALID, np.int8)
-    asked = np.zeros(values.shape, bool)
+    has_vote = np.zeros(values.shape, bool)
     places = rows, pd.Index(seats).get_indexer(pd.Index(votes["judge"]))
-    values[places], asked[places] = _decisions(votes), True
+    values[places], has_vote[places] = _decisions(votes), True
     answers = votes.loc[first, [*answer, "epoch", "benchmark_version"]].reset_index(drop=True)
     first_votes = votes.loc[first, ["task", "side"]]
     answers["task"] = np.where(first_votes["task"] == "correctness", "correctness", first_votes["side"] + "_abstention")
-    complete = asked.all(axis=1)
+    complete = has_vote.all(axis=1)
     return Ratings(answers.loc[complete].reset_index(drop=True), values[complete], seats, answer)
 
 

@@ -64,13 +64,13 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
     answers: list[dict[Any, Any]] = current_rows(workspace, RESPONSES, ["item_id", "model", "created_at"]).to_dict(
         "records"
     )
-    asked: dict[str, list[pd.Timestamp]] = {}
+    times: dict[str, list[pd.Timestamp]] = {}
     for row in answers:
-        asked.setdefault(row["model"], []).append(row["created_at"])
+        times.setdefault(row["model"], []).append(row["created_at"])
     files = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
-        when = max(asked[str(model)])
+        when = max(times[str(model)])
         hub = [_hub_entry(row, dataset, when) for row in entries]
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))

@@ -104,10 +104,10 @@ def _wrong_items(items: Any) -> Iterator[str]:
 
 
 def _wrong_prompts(submission: Submission) -> Iterator[str]:
-    for regime, stated in submission.about.prompts.items():
+    for regime, version in submission.about.prompts.items():
         if regime not in REGIMES:
             yield f"regime {regime[:40]!r}: is unknown"
-        elif stated != prompt_version(regime):
+        elif version != prompt_version(regime):
             yield f"regime {regime}: was asked with another prompt than this version's"
     for regime in sorted({*submission.table(RESPONSES)["regime"]} - {*submission.about.prompts}):
         yield f"regime {str(regime)[:40]!r}: was asked with a prompt that is not named"
@@ -154,13 +154,13 @@ def _named(row: Row) -> str:
 
 
 def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator[str]:
-    asked = dict[tuple[Any, ...], set[str]]()
+    items_of = dict[tuple[Any, ...], set[str]]()
     for row in answers:
         item = items.get(row["item_id"])
         if item is None:
             yield f"answer of {_named(row)}: there is no such item"
             continue
-        asked.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
+        items_of.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
         if any(row[name] != item[name] for name in _SAME):
             yield f"answer of {_named(row)}: its pair, side, dataset or version is not its item's"
         text = row["text"] or ""
@@ -171,7 +171,7 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
     expected = dict[str, set[str]]()
     for id_, item in items.items():
         expected.setdefault(item["dataset"], set()).add(id_)
-    for (dataset, model, regime, run), ids in asked.items():
+    for (dataset, model, regime, run), ids in items_of.items():
         for id_ in sorted(expected[dataset] - ids):
             yield f"answer of {model} ({regime}, run {run}) on {id_}: is missing"
 

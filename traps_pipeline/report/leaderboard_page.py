@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
-from traps_pipeline.protocol.datasets import ARMS, DATASETS, SHORT
+from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.table_columns import (
     EPOCH,
@@ -206,8 +206,8 @@ def _leaderboard(
     rows = _entries(board, dataset, others)
     columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, J]
     for name in others:
-        heading = f"PECS {SHORT[name] if brief else TITLES[name]}"
-        columns.append(Column(name, heading, "fraction", mark=f"{name}_mark", group=name == others[0]))
+        title = name.replace("_ill_posed", " ill-posed") if brief else TITLES[name]  # a comma would end it in a list
+        columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))
     if beside:
         rows, columns = _with_robust(rows, beside), [*columns, *ROBUST_COLUMNS]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]

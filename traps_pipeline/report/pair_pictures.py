@@ -100,12 +100,15 @@ class PairPictures:
         return sheets
 
     def _shortcuts(self) -> Figure:
-        from traps_pipeline.benchmark.shortcuts import shortcuts
+        from traps_pipeline.benchmark.shortcuts import FOLDS, shortcuts
 
         if not len(self.items):
             raise NotRun(NO_ITEMS)
         videos = self.workspace.tables.read_all(VIDEOS)
-        return shortcut_figure(shortcuts(self.items, videos, self.workspace.bring(self.items["clip"])))
+        table = shortcuts(self.items, videos, self.workspace.bring(self.items["clip"]))
+        if not len(table):
+            raise NotRun(f"no dataset has {FOLDS} scenarios")
+        return shortcut_figure(table)
 
 
 def _as_json(rows: pd.DataFrame) -> str:

@@ -137,10 +137,10 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
 def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
-        asked = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
+        answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield Finding(
-            f"{missing} of {asked} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
+            f"{missing} of {answers} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
             f"most, {int(most['n_missing'])}.",
             "leaderboard",
         )

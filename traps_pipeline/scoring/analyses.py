@@ -279,19 +279,21 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
         visual, textual = group.loc[group["dataset"] == taxonomy], group.loc[group["dataset"] != taxonomy]
         by_regime = {r: visual.loc[visual["regime"] == r].set_index("model") for r in PROMPTING}
         standard, guided = (by_regime[r].dropna(subset=SHARES) for r in PROMPTING)
-        asked = textual.loc[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
-        epochs = pd.DataFrame({"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": asked["epoch"]})
+        textual_voids = textual.loc[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
+        epochs = pd.DataFrame(
+            {"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": textual_voids["epoch"]}
+        )
         require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")
-        both, common = (standard.index.intersection(side.index) for side in (guided, asked))
+        both, common = (standard.index.intersection(side.index) for side in (guided, textual_voids))
         change = (guided.loc[both, SHARES] - standard.loc[both, SHARES]).mean()
         row = {"dataset": taxonomy, "sub_scenario": scope, "n_pairs": visual["n_pairs"].max()}
         row |= {"n_models": len(standard)} | standard[SHARES].mean().to_dict()
         row |= {"guided_n_models": len(guided), "uplift_n_models": len(both), "ill_posed_n_models": len(common)}
         row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
         row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
-        means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (asked, standard)]
+        means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (textual_voids, standard)]
         row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(ratio(*means)[0])}
-        row["n_missing"] = sum(int(side["n_missing"].sum()) for side in (standard, guided, asked.loc[common]))
+        row["n_missing"] = sum(int(side["n_missing"].sum()) for side in (standard, guided, textual_voids.loc[common]))
         rows.append(row)
     return pd.DataFrame(rows)
 

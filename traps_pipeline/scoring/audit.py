@@ -63,7 +63,7 @@ def audit() -> pd.DataFrame:
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     """Return the findings for a terminal: every claim, every difference, and counts of the rest; with `everything`,
     all."""
-    lines = []
+    lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
         lines.append(f"{group}: {len(rows)} statements: {counts}")
@@ -287,14 +287,14 @@ def steering_families() -> Iterator[Finding]:
         by_family = group.set_index("direction_family")
         for side in ("control", "void"):
             column = f"{side}_alpha10"
-            stated = float(by_family.loc["all", column])
+            theirs = float(by_family.loc["all", column])
             families = [float(by_family.loc[family, column]) for family in ("oc", "ch")]
             ours = sum(families) / 2
-            verdict: Verdict = AGREES if abs(ours - stated) <= 1 + _SLACK else DIFFERS  # three roundings to a whole
+            verdict: Verdict = AGREES if abs(ours - theirs) <= 1 + _SLACK else DIFFERS  # three roundings to a whole
             sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
-            yield Finding("steering", statement, f"{stated:g}", f"{ours:g}", verdict, reason, _line("steering_regimes"))
+            yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes"))
 
 
 def validation_scores() -> Iterator[Finding]:
@@ -322,9 +322,9 @@ def composition_sums() -> Iterator[Finding]:
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
     for taxonomy in ("occlusion", "chaotic"):
-        stated, ours = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
-        verdict: Verdict = AGREES if ours == stated else DIFFERS
-        shown = str(stated), str(ours)
+        printed, ours = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
+        verdict: Verdict = AGREES if ours == printed else DIFFERS
+        shown = str(printed), str(ours)
         yield Finding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
 
 

@@ -94,16 +94,16 @@ def graded(
     verdicts: pd.DataFrame,
     votes: pd.DataFrame,
     responses: pd.DataFrame,
-    asked: Mapping[str, Asked],
+    questions: Mapping[str, Asked],
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> pd.DataFrame:
     """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, which are given by id."""
-    labels, by_answer = _labels(votes, asked), responses.set_index(_ANSWER)
+    labels, by_answer = _labels(votes, questions), responses.set_index(_ANSWER)
     texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
     rows = []
     for verdict in verdicts.to_dict("records"):
-        key, item = tuple(verdict[name] for name in _ANSWER), asked[verdict["item_id"]]
+        key, item = tuple(verdict[name] for name in _ANSWER), questions[verdict["item_id"]]
         if "probabilities" in (fields_of(verdict["regime"]) or ()):
             figures = _of_probabilities(item, item.read_probabilities(texts.get(key)))
         elif BY_NAME[verdict["regime"]].first_token:
@@ -130,14 +130,14 @@ def _name(scope: int) -> str:
     return f"{SCOPES[scope]:g} to {[*SCOPES, 1.0][scope + 1]:g}"
 
 
-def _labels(votes: pd.DataFrame, asked: Mapping[str, Asked]) -> dict[tuple[Any, ...], str]:
+def _labels(votes: pd.DataFrame, questions: Mapping[str, Asked]) -> dict[tuple[Any, ...], str]:
     """Return the answer of each response by more than half of its judges, "" for one that is none of the item's; no
     entry without such a majority."""
     cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
     chosen = dict[tuple[Any, ...], str]()
     for key, own in cast(Any, cast_votes.groupby(_ANSWER)):
         labels = [
-            asked[key[0]].label_of(value if isinstance(value, str) else None) or ""
+            questions[key[0]].label_of(value if isinstance(value, str) else None) or ""
             for value in own.loc[own["valid"].astype(bool), "extracted_value"]
         ]
         label, n = Counter(labels).most_common(1)[0] if labels else ("", 0)

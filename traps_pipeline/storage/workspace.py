@@ -142,9 +142,9 @@ class Workspace:
             )
         data = read_yaml(path)
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            stated = data.get("format") if isinstance(data, dict) else data
+            its_format = data.get("format") if isinstance(data, dict) else data
             raise TrapsError(
-                f"{path}: workspace format {stated!r}, this version reads {FORMAT}; use the version that made it, "
+                f"{path}: workspace format {its_format!r}, this version reads {FORMAT}; use the version that made it, "
                 "or start a new workspace (its ledger folder can be copied over: answers keep their keys)"
             )
         study = parse_yaml_model(Study, data, path)

@@ -258,11 +258,11 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
     """Return the family's processor around a tokenizer of `make_tokenizer`; `video` overrides its video processor's
     fields."""
     transformers = load_transformers()
-    asked = dict(video or {})
+    video_settings = dict(video or {})
     match family:
         case "qwen3-vl":
             small = {"size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64}, "cap_pixels_per_frame": False}
-            eyes = transformers.Qwen3VLVideoProcessor(**small | asked)
+            eyes = transformers.Qwen3VLVideoProcessor(**small | video_settings)
             still = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
             still["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
             return transformers.Qwen3VLProcessor(
@@ -276,13 +276,13 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
                 feature_extractor=transformers.Gemma4AudioFeatureExtractor(),
                 image_processor=transformers.Gemma4ImageProcessor(),
                 tokenizer=tokenizer,
-                video_processor=transformers.Gemma4VideoProcessor(**asked),
+                video_processor=transformers.Gemma4VideoProcessor(**video_settings),
                 chat_template=_TEMPLATES[family],
             )
         case "llava-next-video":
             side = {"size": {"shortest_edge": 56}, "crop_size": {"height": 56, "width": 56}}
             return transformers.LlavaNextVideoProcessor(
-                video_processor=transformers.LlavaNextVideoVideoProcessor(**side | asked),
+                video_processor=transformers.LlavaNextVideoVideoProcessor(**side | video_settings),
                 image_processor=transformers.LlavaNextImageProcessor(**side, image_grid_pinpoints=[[56, 112]]),
                 tokenizer=tokenizer,
                 chat_template=_TEMPLATES[family],

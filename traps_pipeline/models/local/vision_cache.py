@@ -60,9 +60,9 @@ class ClipMemory:
 
         @functools.wraps(original)  # the library looks at the names of its arguments
         def features(*given: Any, **named: Any) -> Any:
-            asked = dict(names.bind(*given, **named).arguments)
-            rest = asked.pop("kwargs", {})
-            clips = _clips_of(asked)
+            arguments = dict(names.bind(*given, **named).arguments)
+            rest = arguments.pop("kwargs", {})
+            clips = _clips_of(arguments)
             if clips is None:
                 return original(*given, **named)
             keys = [_key(clip) for clip in clips]
@@ -71,7 +71,7 @@ class ClipMemory:
                 if key in rows:
                     self.used += 1
                 else:
-                    rows[key] = self._pass(original, key, {**asked, **clip, **rest})
+                    rows[key] = self._pass(original, key, {**arguments, **clip, **rest})
             return self._joined([rows[key] for key in keys])
 
         owner.get_video_features = features
@@ -80,8 +80,8 @@ class ClipMemory:
         finally:
             del owner.get_video_features  # the class's own method is found again
 
-    def _pass(self, original: Any, key: str, asked: dict[str, Any]) -> _Features:
-        output = original(**asked)
+    def _pass(self, original: Any, key: str, arguments: dict[str, Any]) -> _Features:
+        output = original(**arguments)
         self._form = type(output), isinstance(output.pooler_output, tuple | list)
         self.passes += 1
         tokens = output.pooler_output[0] if self._form[1] else output.pooler_output
@@ -111,15 +111,15 @@ class ClipMemory:
             self._size -= oldest.size
 
 
-def _clips_of(asked: dict[str, Any]) -> list[dict[str, Tensor]] | None:
+def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
     """Return the arguments of each clip alone; None where a class does not say which pixels are whose."""
-    pixels, grids = asked["pixel_values_videos"], asked.get("video_grid_thw")
+    pixels, grids = arguments["pixel_values_videos"], arguments.get("video_grid_thw")
     if grids is not None:  # Qwen3-VL: patches of all clips one after the other, and how many each has
         parts = pixels.split(grids.prod(-1).tolist())
         return [
             {"pixel_values_videos": part, "video_grid_thw": grid[None]} for part, grid in zip(parts, grids, strict=True)
         ]
-    counts, places = asked.get("num_frames_per_video"), asked.get("video_position_ids")
+    counts, places = arguments.get("num_frames_per_video"), arguments.get("video_position_ids")
     if counts is not None and places is not None:  # Gemma 4: frames of all clips one after the other
         each = zip(pixels.split(counts.tolist()), places.split(counts.tolist()), counts, strict=True)
         names = ("pixel_values_videos", "video_position_ids", "num_frames_per_video")

@@ -37,8 +37,8 @@ def models(workspace: Workspace, key: str) -> str:
 @_source(kinds=["text"], scheme=EVALUATION)
 def prompts(workspace: Workspace, key: str) -> str:
     """assets/prompts: the regime's system prompt, by evaluation."""
-    asked = {d for experiment in workspace.study.experiments.values() for d in experiment.datasets}
-    return prompt_version(Evaluation.parse(key).regime, asked)
+    datasets = {d for experiment in workspace.study.experiments.values() for d in experiment.datasets}
+    return prompt_version(Evaluation.parse(key).regime, datasets)
 
 
 @_source(kinds=["yaml"])

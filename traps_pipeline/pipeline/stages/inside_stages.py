@@ -83,8 +83,8 @@ def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
 def _gated(partitions: StudyPartitions, key: str) -> bool:
     """Return whether the model of an extraction is asked, so that there are answers to gate."""
     extraction = Extraction.parse(key)
-    asked = {(e.model, e.regime) for e in partitions.evaluations}
-    return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in asked for r in PROMPTING)
+    evaluations = {(e.model, e.regime) for e in partitions.evaluations}
+    return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in evaluations for r in PROMPTING)
 
 
 _gates = partial(
@@ -134,8 +134,8 @@ def item_scores(workspace: Workspace, key: str) -> StageOutput:
 
 def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
     extraction = Extraction.parse(key)
-    asked = {(e.model, e.regime) for e in partitions.evaluations}
-    return partitions.reads_sentences and (extraction.model, extraction.prompt) in asked
+    evaluations = {(e.model, e.regime) for e in partitions.evaluations}
+    return partitions.reads_sentences and (extraction.model, extraction.prompt) in evaluations
 
 
 @_stage(

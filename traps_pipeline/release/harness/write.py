@@ -100,9 +100,9 @@ def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
             continue
         clip = row["media_digest"]
         if clip not in prepared:
-            sent = store.prepare(release / CLIPS / row["file_name"], clip, media)
+            media_sent = store.prepare(release / CLIPS / row["file_name"], clip, media)
             prepared[clip] = []
-            for number, part in enumerate(payload(sent)):
+            for number, part in enumerate(payload(media_sent)):
                 name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media.profile == "images" else ".mp4")
                 write_bytes(package / name, part)
                 prepared[clip].append(name)

@@ -78,9 +78,9 @@ def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
     """Return the panels of standard and of guided, a column a model."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
-    asked = [model for model in load_models() if model in set(cells["model"])]
-    video = [m for m in analyses.models_of(media="video", group="main") if m in asked]
-    models = (video or asked)[:MOST_MODELS]
+    models_here = [model for model in load_models() if model in set(cells["model"])]
+    video = [m for m in analyses.models_of(media="video", group="main") if m in models_here]
+    models = (video or models_here)[:MOST_MODELS]
     panels = []
     for regime in PROMPTING:
         part = cells.loc[(cells["regime"] == regime) & cells["model"].isin(models)]

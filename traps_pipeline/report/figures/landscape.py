@@ -45,7 +45,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     with figure_style():
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
-        frame_plane(axes, points, f"Acc, {scope.lower()}")
+        frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
         labels = merged_labels(_draw_models(axes, points), axes)
         guided = points.loc[points["regime"] == GUIDED]
         _draw_frontier(axes, guided)

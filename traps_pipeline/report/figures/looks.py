@@ -45,10 +45,14 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {m: (colours[m], MARKERS[alike[colours[m]].index(m) % len(MARKERS)]) for m in set(models)}
 
 
-def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str) -> None:
-    """Set the limits around points (columns j and acc), at least half of each axis, and draw contours of PECS."""
-    low, high = _limits(points.loc[:, "acc"], 0.0, 0.0)
-    left, right = _limits(points.loc[:, "j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
+def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
+    """Set the limits around points (columns j and acc), at least half of each axis, and draw contours of PECS.
+
+    intervals: whether the 95 % intervals of the points are drawn, too.
+    """
+    acc, j = (_values(points, name, least, intervals=intervals) for name, least in (("acc", 0.0), ("j", -1.0)))
+    low, high = _limits(acc, 0.0, 0.0)
+    left, right = _limits(j, min([-0.08, *(j - 0.08)]), 0.3)
     axes.set(xlim=(left, right + 0.03), ylim=(low - 0.03, high + 0.03), xlabel="J = AbsRec − FalseAbs", ylabel=ylabel)
     axes.locator_params(axis="x", nbins=6)
     axes.axvline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
@@ -63,13 +67,23 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str) -> None:
     axes.annotate("PECS", (right, high), (labelled, high + 0.035), **edge)
 
 
-def _limits(values: pd.Series, low: float, least: float) -> tuple[float, float]:
+def _values(points: pd.DataFrame, name: str, least: float, *, intervals: bool) -> np.ndarray:
+    """Return the values of a column, and the ends of their intervals, cut to what they can be."""
+    names = [name, *(end for end in (f"{name}_ci_low", f"{name}_ci_high") if intervals and end in points)]
+    values = points[names].to_numpy(float).ravel()
+    return np.clip(values[np.isfinite(values)], least, 1.0)
+
+
+def _limits(values: np.ndarray, low: float, least: float) -> tuple[float, float]:
     """Return ends of an axis of fractions: tenths around the values, within [low, 1], the upper at least `least`."""
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)
     top = min(1.0, max(least, float(np.ceil(10 * values.max() + 0.8)) / 10))
-    return min(bottom, top - 0.5) if not least else bottom, top
+    if least:
+        return bottom, top
+    bottom = max(low, min(bottom, top - 0.5))
+    return bottom, max(top, min(1.0, bottom + 0.5))
 
 
 def legend_key(label: str, colour: str, marker: str = "", line: Any = "none", size: float = 4, **look: Any) -> Line2D:

@@ -80,7 +80,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
         matching = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
         return {tuple(row[key] for key in KEYS): row for row in matching.to_dict("records")}  # pyright: ignore[reportReturnType]
 
-    asked = by_pair("transfer", rows["model"].notna())
+    transfers = by_pair("transfer", rows["model"].notna())
     known = rows["value"].notna()
     figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
@@ -95,7 +95,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
         | {"note": next((of[key]["note"] for of in notes if key in of), "")}
         for model in rows["model"].unique()
         for key in ((str(model), *pair) for pair in TRANSFER_PAIRS)
-        if key in asked
+        if key in transfers
     ]
     return pd.DataFrame(table)
 
