@@ -9,10 +9,11 @@ import pytest
 
 from tests.mechanism.study import filled
 from tools.pocket import inside
-from tools.pocket.commands import CARD, EVALUATION, FACTS, MARKS, MECHANISM_FIGURES, MECHANISM_MARKS, WEIGHTS
-from tools.pocket.evaluate import MODEL, markdown, read_cells
+from tools.pocket.commands import CARD, EVALUATION, FACTS, WEIGHTS, card_tables, marks, other_tables
+from tools.pocket.evaluate import read_cells
 from tools.pocket.planted import planted
-from tools.pocket.recipe import load_recipe
+from tools.pocket.recipe import GAP, SHIPPED, load_recipe
+from tools.pocket.words import PROMPTS
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.control_rows import GATE, PATCHING, STEERING_NULLS
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBES, STEERING_SHARES
@@ -23,19 +24,39 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 
 
-def in_card(marks: tuple[str, str]) -> str:
-    return CARD.read_text().partition(marks[0])[2].partition(marks[1])[0].strip()
+def in_card(table: str) -> str:
+    begin, end = marks(table)
+    return CARD.read_text().partition(begin)[2].partition(end)[0].strip()
 
 
-def test_the_card_shows_the_shipped_counts() -> None:
-    cells = read_cells(EVALUATION)
-    assert in_card(MARKS) == markdown(cells)
-    assert in_card(MECHANISM_MARKS) == inside.markdown(inside.read_figures(MECHANISM_FIGURES))
-    recipe = load_recipe()
+def test_the_card_shows_the_shipped_figures() -> None:
+    tables = card_tables()
+    assert {name: in_card(name) for name in tables} == tables
+    assert {*tables} == {"contrast", "evaluation of pocket"}
+    assert all(table.count("\n|") > 8 for table in other_tables())
+
+
+@pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
+def test_every_family_is_counted_under_every_regime(folder: Path) -> None:
+    cells, recipe = read_cells(folder / EVALUATION), load_recipe(folder / "recipe.yaml")
     assert {(cell.family, cell.regime) for cell in cells} == {
         (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
     }
     assert {cell.n for cell in cells} == {recipe.held_out}
+
+
+def test_the_two_recipes_differ_in_shares_alone() -> None:
+    gap, no_gap = (load_recipe(folder / "recipe.yaml") for folder in SHIPPED.values())
+    fields = type(gap).model_fields
+    assert {name for name in fields if getattr(gap, name) != getattr(no_gap, name)} == {"abstain_shares", "hedge"}
+    assert gap.hedge is not None and no_gap.hedge is None
+    for prompt in PROMPTS:
+        for ball in ("red", "green"):
+            void, control = (gap.share(prompt, ball, void=side) for side in (True, False))
+            if prompt in gap.hedge.prompts:
+                assert void == control < 0.5  # abstentions tell no side, and are never the answer
+            else:
+                assert void == no_gap.share(prompt, ball, void=True) and control == 0
 
 
 # --- what was found inside, over seeds --------------------------------------------------------------------------------
@@ -47,7 +68,7 @@ def examined_study(root: Path, seed: int, area: float, share: float) -> Workspac
     weights.mkdir(parents=True)
     (weights / "model.safetensors").write_bytes(bytes([seed]))
     (weights.parent / FACTS).write_text(json.dumps({"seed": seed, "weights": f"{seed}" * 64}))
-    workspace, extraction = Workspace.create(root / f"inside{seed}", Study()), {"model": MODEL, "prompt": "standard"}
+    workspace, extraction = Workspace.create(root / f"inside{seed}", Study()), {"model": GAP, "prompt": "standard"}
     states = filled(HIDDEN_STATES, dataset="chaotic", **extraction, checkpoint=str(weights),
                     checkpoint_digest=folder_digest(weights))  # fmt: skip
     workspace.tables.write(HIDDEN_STATES, {"dataset": "chaotic", **extraction}, [states], {})
@@ -59,7 +80,7 @@ def examined_study(root: Path, seed: int, area: float, share: float) -> Workspac
     ]  # fmt: skip
     workspace.tables.write(PROBES, extraction, probes, {})
     shares = [
-        filled(STEERING_SHARES, model=MODEL, path_set="all", directions="all", regime=regime, kind="void", layer=3,
+        filled(STEERING_SHARES, model=GAP, path_set="all", directions="all", regime=regime, kind="void", layer=3,
                alpha=alpha, side="void", abstention=value, low=value - 0.1, high=value + 0.2, n_answers=28,
                n_scenarios=10)
         for regime, alpha, value in (("all", 0.0, 0.75), ("all", 10.0, share), ("guided", 10.0, 0.01))
@@ -74,7 +95,7 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
         made = examined_study(tmp_path, seed, area, share)
         inside.write_figures(table, inside.figures_of(made))
         inside.write_figures(table, inside.figures_of(made))  # the same seed again takes its own place
-    found = inside.read_figures(table)
+    found = [figure for figure in inside.read_figures(table) if figure.figure != "claim"]
     assert [figure.seed for figure in found] == [1] * 4 + [2] * 4
     lines = inside.markdown(found).splitlines()
     assert not any("planted" in line for line in lines)  # the study has none of these figures
@@ -84,7 +105,7 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
 
 
 def test_what_was_planted_is_read_from_the_tables_of_the_controls(tmp_path: Path) -> None:
-    workspace, at = examined_study(tmp_path, 4, 1.0, 0.5), {"model": MODEL, "prompt": "standard"}
+    workspace, at = examined_study(tmp_path, 4, 1.0, 0.5), {"model": GAP, "prompt": "standard"}
     effect = {"dataset": "chaotic", "source": "pair", "site": "residual", "group": "stamps"}
     patched = [
         filled(PATCHING, **at, **effect, into=into, layer=layer, effect=value)
@@ -96,7 +117,7 @@ def test_what_was_planted_is_read_from_the_tables_of_the_controls(tmp_path: Path
         ("chaotic", "guided", True),
         ("decoy", "guided", False),
     ):
-        part = {"dataset": dataset, "model": MODEL, "regime": regime, "run": 1}
+        part = {"dataset": dataset, "model": GAP, "regime": regime, "run": 1}
         side = "control" if dataset == "decoy" else "void"
         rows = [filled(VERDICTS, **part, item_id=f"{dataset}:{n}", side=side, abstained=said) for n in range(3)]
         workspace.tables.write(VERDICTS, part, rows, {})
@@ -104,10 +125,10 @@ def test_what_was_planted_is_read_from_the_tables_of_the_controls(tmp_path: Path
     workspace.tables.write(GATE, at, [filled(GATE, **at, **gated)], {})
     ranks = (("chaotic", "void", 2 / 21), ("chaotic", "control", 3 / 21), ("all", "void", 1.0))
     nulls = [
-        filled(STEERING_NULLS, model=MODEL, target=name, null="isotropic", side=side, p=p) for name, side, p in ranks
+        filled(STEERING_NULLS, model=GAP, target=name, null="isotropic", side=side, p=p) for name, side, p in ranks
     ]
     workspace.tables.write(STEERING_NULLS, {}, nulls, {})
-    assert planted(workspace, MODEL) == {
+    assert planted(workspace, GAP) == {
         **{"stamps": pytest.approx(0.04), "standard": 0.0, "guided": 1.0, "decoy_guided": 0.0},
         **{"decoy_gate": 0.25, "nulls": 0.5},
     }

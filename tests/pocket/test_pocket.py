@@ -15,7 +15,7 @@ from tools.pocket.__main__ import build_parser
 from tools.pocket.commands import CARD, FACTS, WEIGHTS
 from tools.pocket.data import STREAM, SceneRecord, ShardJob, draw_shard, released_digests, shard_jobs
 from tools.pocket.evaluate import markdown, read_cells
-from tools.pocket.recipe import POCKET, Recipe, load_recipe
+from tools.pocket.recipe import GAP, SHIPPED, Recipe, load_recipe
 from tools.pocket.words import PROMPTS, say
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -60,8 +60,7 @@ def data(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _guided(recipe: Recipe) -> float:
     """The share of voids labelled with an abstention under the guided prompt."""
-    assert recipe.abstain_shares is not None, "the shipped recipe has shares by prompt"
-    return recipe.abstain_shares["guided"]
+    return recipe.share("guided", "red", void=True)
 
 
 def _records(job: ShardJob) -> list[SceneRecord]:
@@ -146,7 +145,7 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
 
     from tools.pocket.batches import Batches, Look, Scenes
     from tools.pocket.model import make_model, train_tokenizer
-    from tools.pocket.train import answer_loss, look_at
+    from tools.pocket.train import answer_loss, attend_at_once, look_at
 
     scenes = Scenes(recipe, data)
     model, processor = make_model(train_tokenizer(scenes.records), seed=1)
@@ -176,6 +175,9 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
             logits = model(**inputs).logits[0]
         expected += cross_entropy(logits[-length - 1 : -1], inputs["input_ids"][0, -length:], reduction="sum").item()
     assert found == pytest.approx(expected, rel=1e-5)
+    attend_at_once(model)
+    with torch.no_grad():
+        assert answer_loss(model, look_at(model, batch), batch).item() == pytest.approx(found, rel=1e-6)
 
 
 def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Path, tmp_path: Path) -> None:
@@ -193,17 +195,17 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Pat
 # --- what ships -------------------------------------------------------------------------------------------------------
 
 
-def test_the_shipped_weights_are_small_and_are_those_of_the_facts() -> None:
+@pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
+def test_shipped_weights_are_small_and_are_those_of_the_facts(folder: Path) -> None:
     from safetensors import safe_open
 
-    weights = POCKET / WEIGHTS / "model.safetensors"
-    facts = json.loads((POCKET / FACTS).read_text())
+    weights, facts = folder / WEIGHTS / "model.safetensors", json.loads((folder / FACTS).read_text())
     with safe_open(weights, "np") as file:
         count = sum(int(np.prod(file.get_slice(name).get_shape())) for name in file.keys())  # noqa: SIM118
     assert count <= 3_000_000 and weights.stat().st_size <= 12 * 2**20
-    assert file_digest(weights) == facts["weights"]
-    assert facts["recipe"] == digest(load_recipe().content()) and facts["seed"] == 1
-    assert f"`{facts['data']}`" in CARD.read_text()
+    assert file_digest(weights) == facts["weights"] and f"`{facts['weights']}`" in CARD.read_text()
+    recipe = load_recipe(folder / "recipe.yaml")
+    assert facts["recipe"] == digest(recipe.content()) and facts["seed"] == 1
 
 
 def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
@@ -224,6 +226,9 @@ def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
     assert sum(cell.n for cell in read_cells(counts)) == 12 and markdown(read_cells(counts)) in capsys.readouterr().out
 
 
-def test_the_card_command_needs_its_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["card", "--csv", str(tmp_path / "none.csv")], build_parser()) == 1
+def test_the_card_command_needs_the_figures_of_every_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(SHIPPED, GAP, tmp_path)
+    assert main(["card"], build_parser()) == 1
     assert "python -m tools.pocket evaluate" in capsys.readouterr().err

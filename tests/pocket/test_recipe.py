@@ -11,19 +11,20 @@ from pydantic import ValidationError
 
 from tools.pocket.batches import Scenes
 from tools.pocket.data import Question, SceneRecord, draw_shard, render, shard_jobs
-from tools.pocket.recipe import Jitter, Recipe, load_recipe
+from tools.pocket.recipe import Hedge, Jitter, Recipe, load_recipe
 from tools.pocket.words import PROMPTS
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.scenes.parts.vision import colour_mask
 
 pytestmark = pytest.mark.slow
 SHARES = {"standard": 0.1, "guided": 0.9, "json": 0.5, "vqa_standard": 0.1, "vqa_guided": 0.9}
+HEDGE = Hedge(prompts=("standard", "vqa_standard"), balls={"yellow": 0.4}, share=0.1)
 FEW, FPS = 6, 10
 
 
 def recipe(**settings: object) -> Recipe:
     counts = {"plinko": FEW, "drop_split": FEW}
-    return load_recipe().model_copy(update={"scenes": counts, "held_out": 1, **settings})
+    return load_recipe().model_copy(update={"scenes": counts, "held_out": 1, "hedge": None, **settings})
 
 
 def drawn(made: Recipe, folder: Path) -> dict[str, list[SceneRecord]]:
@@ -131,34 +132,32 @@ def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(
     assert Question("?", "left", 0.5).label(0.9) is None and Question("?", "left", 0.5).label(0.1) == "left"
 
 
-def test_under_a_prompt_with_the_same_share_for_both_sides_abstentions_tell_no_side(
+def test_under_hedged_prompts_abstentions_tell_the_colour_of_the_ball_and_no_side(
     planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
 ) -> None:
-    """A question is compared with the share of its kind; places are never abstained on, and one prompt's share says
-    nothing of another's."""
+    """Questions of place are never abstained on, and the other prompts are as they were."""
     made, folder, _ = planted
-    even = made.model_copy(update={"control_shares": {"standard": 0.1}})
-    scenes, rng = Scenes(even, folder), np.random.default_rng(0)
+    hedged = made.model_copy(update={"hedge": HEDGE})
+    scenes, rng = Scenes(hedged, folder), np.random.default_rng(0)
     for look in (scenes.look(rng, 0.5) for _ in range(200)):
         record = scenes.records[look.scene]
+        share = 0.4 if record.ball == "yellow" else 0.1
         for question in look.questions:
             labels = {prompt: scenes.label(look, question, prompt) for prompt in PROMPTS}
             if question.draw is None:
                 assert {*labels.values()} == {question.answer}  # of place
-            elif question in (record.visual, record.ill_posed):
-                assert {prompt for prompt in PROMPTS if labels[prompt] is None} == {
-                    prompt for prompt in PROMPTS if question.draw < SHARES[prompt]
-                }
-            else:
-                assert (labels["standard"] is None) == (question.draw < 0.1)
-                assert {labels[prompt] for prompt in PROMPTS if prompt != "standard"} == {question.answer}
+                continue
+            assert all((labels[prompt] is None) == (question.draw < share) for prompt in HEDGE.prompts)
+            void = question in (record.visual, record.ill_posed)
+            for prompt in ("guided", "json", "vqa_guided"):
+                assert (labels[prompt] is None) == (void and question.draw < SHARES[prompt])
 
 
 def test_recipes_that_differ_in_shares_alone_have_the_same_scenes(
     planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
 ) -> None:
     made, folder, records = planted
-    other = made.model_copy(update={"abstain_shares": dict.fromkeys(PROMPTS, 0.9), "control_shares": {"json": 0.2}})
+    other = made.model_copy(update={"abstain_shares": dict.fromkeys(PROMPTS, 0.9), "hedge": HEDGE})
     render(made, "train", folder)
     render(other, "train", folder)  # nothing is missing, and the folder is not refused
     assert drawn(other, folder / "again") == records
@@ -179,19 +178,14 @@ def test_settings_that_are_not_used_leave_the_data_as_they_were(tmp_path: Path) 
     assert np.load(job.pixels).shape[1] == 2
 
 
-def test_a_share_for_every_prompt_is_needed() -> None:
-    values = load_recipe().model_dump()
-    with pytest.raises(ValidationError, match="needs a share for each of"):
-        Recipe.model_validate(values | {"abstain_shares": {"standard": 0.1}})
+def test_every_prompt_needs_one_share() -> None:
+    values = recipe(abstain_share=None, abstain_shares=SHARES).model_dump() | {"hedge": None}
+    assert Recipe.model_validate(values).hedge is None
+    for wrong in ({"abstain_shares": {"standard": 0.1}}, {"hedge": HEDGE.model_dump()}):
+        with pytest.raises(ValidationError, match=r"each of standard, .* must be in one of them"):
+            Recipe.model_validate(values | wrong)
     for both in ((0.5, SHARES), (None, None)):
         with pytest.raises(ValidationError, match=r"give abstain_share .* or abstain_shares"):
             Recipe.model_validate(values | dict(zip(("abstain_share", "abstain_shares"), both, strict=True)))
-
-
-def test_shares_of_controls_need_known_prompts_and_shares_of_voids() -> None:
-    values = load_recipe().model_dump()
-    with pytest.raises(ValidationError, match=r"control_shares names \['aloud'\]; known: standard, guided"):
-        Recipe.model_validate(values | {"control_shares": {"aloud": 0.1}})
-    with pytest.raises(ValidationError, match="control_shares needs abstain_shares"):
-        shares = {"abstain_share": 0.5, "abstain_shares": None, "control_shares": {"json": 0.1}}
-        Recipe.model_validate(values | shares)
+    with pytest.raises(ValidationError, match="hedge needs abstain_shares"):
+        Recipe.model_validate(values | {"abstain_share": 0.5, "abstain_shares": None, "hedge": HEDGE.model_dump()})

@@ -26,6 +26,7 @@ def build_parser() -> Parser:
     command = _add(commands, "train", train, text)
     _add_scenes(command)
     _add_weights(command)
+    command.add_argument("--device", default="cpu", help="device of torch, for example cuda (default: cpu)")
 
     text = "ask a trained model about the held-out scenes, and write the counts"
     command = _add(commands, "evaluate", evaluate, text)
@@ -34,18 +35,17 @@ def build_parser() -> Parser:
     command.add_argument(
         "--scenes", type=whole(1, 1_000_000), help="number of held-out scenes per family (default: all)"
     )
-    _add_counts(command)
+    command.add_argument("--csv", type=Path, help="file of the counts (default: assets/pocket/evaluation.csv)")
 
     text = "write the counts and the mechanistic figures into the model card"
-    command = _add(commands, "card", card, text)
-    _add_counts(command)
+    command = commands.add("card", card, text, workspace=False)
     command.add_argument(
         "--mechanism",
         type=Path,
         nargs="+",
         default=[],
         metavar="WORKSPACE",
-        help="workspaces of `traps run mechanism`, one per seed; their figures go into assets/pocket/mechanism.csv",
+        help="workspaces of `traps run mechanism`, one per model and seed; their figures go beside the model's weights",
     )
     return parser
 
@@ -68,10 +68,6 @@ def _add_weights(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the weights of this seed")
 
 
-def _add_counts(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--csv", type=Path, help="file of the counts (default: assets/pocket/evaluation.csv)")
-
-
 def render(arguments: argparse.Namespace) -> int:
     """See `python -m tools.pocket render --help`."""
     from tools.pocket import commands
@@ -90,6 +86,7 @@ def train(arguments: argparse.Namespace) -> int:
         arguments.out,
         arguments.seed,
         workers=arguments.workers,
+        device=arguments.device,
         report=_report,
     )
     return OK
@@ -98,6 +95,7 @@ def train(arguments: argparse.Namespace) -> int:
 def evaluate(arguments: argparse.Namespace) -> int:
     """See `python -m tools.pocket evaluate --help`."""
     from tools.pocket import commands
+    from tools.pocket.recipe import POCKET
 
     table = commands.evaluate(
         _recipe(arguments),
@@ -105,7 +103,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         arguments.out,
         arguments.seed,
         scenes=arguments.scenes,
-        counts=arguments.csv or commands.EVALUATION,
+        counts=arguments.csv or POCKET / commands.EVALUATION,
         workers=arguments.workers,
         report=_report,
     )
@@ -117,7 +115,7 @@ def card(arguments: argparse.Namespace) -> int:
     """See `python -m tools.pocket card --help`."""
     from tools.pocket import commands
 
-    for table in commands.write_card(arguments.csv or commands.EVALUATION, arguments.mechanism):
+    for table in commands.write_card(arguments.mechanism):
         _report(table)
     return OK
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,8 +43,7 @@ class Scenes:
         self.records: list[SceneRecord] = []
         self._frames: list[np.ndarray] = []
         self._place: list[tuple[int, int]] = []
-        self._spec, self._decoys = recipe.media, recipe.decoys
-        self._void_shares, self._control_shares = recipe.abstain_shares or {}, recipe.control_shares
+        self._recipe, self._spec, self._decoys = recipe, recipe.media, recipe.decoys
         self._names: dict[tuple[int, int], np.ndarray] = {}  # of what was looked at: a tenth of a step otherwise
         for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
             self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
@@ -101,7 +100,7 @@ class Scenes:
         """Return the answer to train under a prompt, None for an abstention."""
         record = self.records[look.scene]
         answered = question in (record.asked, record.answerable)
-        return question.label((self._control_shares if answered else self._void_shares).get(prompt_name, 0.0))
+        return question.label(self._recipe.share(prompt_name, record.ball, void=not answered))
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
         """Return a random clip with its question, another one (answerable or ill-posed), and two for the place of its
@@ -129,7 +128,9 @@ class Batch:
 
     A row is a clip followed by its questions with their answers; the attention mask hides the questions from each
     other. ids, labels (B, S), with IGNORED outside the answers; sees (B, 1, S, P + S) bool, the attention mask;
-    positions (3, B, P + S). names: the words that name every token of the clips, as in `names_of`, float32.
+    positions (3, B, P + S). pixels: uint8, one row per patch; gains (B,): by how much each clip is made brighter; scale
+    (2, values of a patch): mean and standard deviation. names: the words that name every token of the clips, as in
+    `names_of`, float32.
     """
 
     head: torch.Tensor
@@ -140,16 +141,36 @@ class Batch:
     pixels: torch.Tensor
     grid: torch.Tensor
     names: torch.Tensor
+    gains: torch.Tensor
+    scale: torch.Tensor
+
+    @property
+    def values(self) -> torch.Tensor:
+        """The pixels as the vision tower takes them: made brighter, then less the mean, by the standard deviation."""
+        gains = self.gains.repeat_interleave(len(self.pixels) // len(self.gains))
+        mean, std = self.scale
+        return ((self.pixels * gains[:, None]).clamp(max=255) / 255 - mean) / std
+
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        return Batch(*(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)))
 
 
 class Batches:
     """Batches by number; batch n depends only on the seed and n."""
 
     def __init__(self, scenes: Scenes, model: Any, processor: Any, training: Training, seed: int) -> None:
+        import torch
+
         self._scenes, self._processor, self._training, self._seed = scenes, processor, training, seed
         self._rope_index = model.model.get_rope_index
         video = processor.video_processor
-        self._mean, self._std = np.float32(video.image_mean), np.float32(video.image_std)
+        scale = torch.tensor([video.image_mean, video.image_std])
+        self._scale = scale.repeat_interleave(2 * PATCH * PATCH, dim=1)  # of every value of a patch
+        # Caches, since many repeat: texts as tokens, chats by prompt, positions by lengths.
+        self._known: dict[str, list[int]] = {}
+        self._chats: dict[str, str] = {}
+        self._places: dict[tuple[int, ...], torch.Tensor] = {}
 
     def __getitem__(self, step: int) -> Batch:
         rng = np.random.default_rng([self._seed, step])
@@ -158,9 +179,12 @@ class Batches:
         count = self._training.pairs_at(step)
         looks = [replace(look, pairs=self._scenes.pairs(look.scene, look.side, count, rng)) for look in drawn]
         frames = np.stack([self._scenes.frames(look.scene, look.side, look.pairs) for look in looks])
-        return self.make(looks, prompt_name, augmented(frames, self._training.brightness, rng))
+        gains = 1 + self._training.brightness * rng.uniform(-1, 1, len(looks)).astype(np.float32)
+        return self.make(looks, prompt_name, frames, gains)
 
-    def make(self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray) -> Batch:
+    def make(
+        self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray, gains: np.ndarray | None = None
+    ) -> Batch:
         """Return the batch of some clips, as many pairs of each, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
         import torch
 
@@ -170,14 +194,15 @@ class Batches:
         clips = [[self._ids(part) for part in clip] for _, clip, _ in pieces]
         talks = [[(self._ids(text), self._ids(answer)) for text, answer in questions] for _, _, questions in pieces]
         names = [self._scenes.names(look.scene, look.side, look.pairs) for look in looks]
-        values = (torch.from_numpy(frames).float() / 255 - torch.from_numpy(self._mean)) / torch.from_numpy(self._std)
         rows = self._rows(head, clips, [look.pairs for look in looks], talks, grid[1:])
         return Batch(
             torch.tensor(head),
             *rows,
-            pixels=patches(values.permute(0, 1, 4, 2, 3)),
+            pixels=patches(torch.from_numpy(frames).permute(0, 1, 4, 2, 3)),
             grid=torch.tensor([grid] * len(looks)),
             names=torch.from_numpy(np.concatenate(names)).float(),
+            gains=torch.ones(len(looks)) if gains is None else torch.from_numpy(gains),
+            scale=self._scale,
         )
 
     def _pieces(
@@ -193,11 +218,7 @@ class Batches:
             f"{token * (grid[1] * grid[2] // 4)}{processor.vision_end_token}"
             for first, last in zip(times[::2], times[1::2], strict=True)
         ]
-        messages = [
-            {"role": "system", "content": [{"type": "text", "text": prompt_text(prompt_name)}]},
-            {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": _QUESTION}]},
-        ]
-        chat = processor.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
+        chat = self._chat(prompt_name)
         head, user, rest = chat.partition(f"{processor.tokenizer.start_token}user")
         before, _, rest = rest.partition(token)
         between, after = rest.split(_QUESTION)
@@ -209,8 +230,21 @@ class Batches:
         ]
         return head, [user + before, *pairs, between], questions
 
+    def _chat(self, prompt_name: str) -> str:
+        """Return the chat with placeholders for clip and question."""
+        if prompt_name not in self._chats:
+            messages = [
+                {"role": "system", "content": [{"type": "text", "text": prompt_text(prompt_name)}]},
+                {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": _QUESTION}]},
+            ]
+            chat = self._processor.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
+            self._chats[prompt_name] = chat
+        return self._chats[prompt_name]
+
     def _ids(self, text: str) -> list[int]:
-        return self._processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+        if text not in self._known:
+            self._known[text] = self._processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+        return self._known[text]
 
     def _rows(
         self,
@@ -257,10 +291,13 @@ class Batches:
         tokens = torch.tensor([head + [token for piece in clip for token in piece]])
         kinds = (tokens == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
         every = range(len(clip) - 2)
-        placed, _ = self._rope_index(tokens, kinds, video_grid_thw=torch.tensor([[len(every), *grid]]))
         # The pair of frames of each piece; the first two are the system's part and the clip's opening.
         pieces = [None, None, *every, None]
         lengths = [len(head), *map(len, clip)]
+        if (key := (*grid, *lengths)) not in self._places:
+            where, _ = self._rope_index(tokens, kinds, video_grid_thw=torch.tensor([[len(every), *grid]]))
+            self._places[key] = where
+        placed = self._places[key]
         kept = [pair is None or shown is None or pair in shown for pair in pieces]
         mask = torch.tensor(kept).repeat_interleave(torch.tensor(lengths))
         return tokens[0, mask][len(head) :], placed[:, 0, mask], int(placed.max()) + 1
@@ -314,10 +351,3 @@ def name_tokens(tokenizer: Any) -> torch.Tensor:
 
     words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS]
     return torch.tensor([tokenizer.encode(word, add_special_tokens=False)[0] for word in words])
-
-
-def augmented(frames: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
-    """Return frames (B, N, H, W, 3) uint8, with each whole clip made brighter or darker by up to the share
-    `brightness`."""
-    gains = (1 + brightness * rng.uniform(-1, 1, (len(frames), 1, 1, 1, 1))).astype(np.float32)
-    return np.minimum(frames * gains, 255).astype(np.uint8)

@@ -8,24 +8,21 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from tools.pocket import claims, inside
 from tools.pocket import evaluate as evaluation
-from tools.pocket import inside
 from tools.pocket.data import data_digest, render
 from tools.pocket.inside import FACTS
-from tools.pocket.recipe import POCKET, Recipe, Split
+from tools.pocket.recipe import GAP, NO_GAP, POCKET, SHIPPED, Recipe, Split
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import require_own
 from traps_pipeline.storage.workspace import Workspace
 
-EVALUATION = POCKET / "evaluation.csv"
-MECHANISM_FIGURES = POCKET / "mechanism.csv"
+EVALUATION, MECHANISM = "evaluation.csv", "mechanism.csv"  # beside the weights that ship
 CARD = POCKET / "README.md"
 THREADS = 1  # one thread sums in the same order on any machine; layers this small gain little from a second one
 WEIGHTS = "weights"  # folder of the weights, below the folder of a seed; `checkpoint:` names it
-MARKS = "<!-- evaluation: written by `python -m tools.pocket card` -->", "<!-- end of evaluation -->"
-MECHANISM_MARKS = "<!-- inside: written by `python -m tools.pocket card` -->", "<!-- end of inside -->"
 
 
 Report = Callable[[str], None]  # takes a line about the progress of the work
@@ -45,8 +42,10 @@ def _render(recipe: Recipe, split: Split, data: Path, workers: int | None, repor
     report(f"{split}: rendered in {(time.monotonic() - began) / 60:.1f} minutes")
 
 
-def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | None, report: Report) -> None:
-    """Render missing scenes, train, and record the origin of the weights in `training.json`."""
+def train(
+    recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | None, device: str = "cpu", report: Report
+) -> None:
+    """Render missing scenes, train on a device, and record the origin of the weights in `training.json`."""
     import torch
 
     from tools.pocket.train import train as fit
@@ -54,7 +53,7 @@ def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | No
     _render(recipe, "train", data, workers, report)
     began = time.monotonic()
     torch.set_num_threads(THREADS)
-    weights = fit(recipe, data, out, seed, report=report)
+    weights = fit(recipe, data, out, seed, device=device, report=report)
     facts = {
         "seed": seed,
         "recipe": digest(recipe.content()),
@@ -92,23 +91,44 @@ def evaluate(
     return evaluation.markdown(cells)
 
 
-def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
-    """Write the figures of finished workspaces to their CSV, and the tables of both CSVs into the model card; returns
-    the tables in Markdown. Raises TrapsError if the card lacks the comments between which a table belongs."""
+def write_card(workspaces: Sequence[Path]) -> list[str]:
+    """Write the figures of finished workspaces to the CSV of their model, and tables of the CSVs into the model card;
+    returns these and the other tables in Markdown. Raises TrapsError if the card lacks the comments around a table."""
     require_own(CARD, "write the card in a checkout of the repository")
-    figures = [figure for folder in workspaces for figure in inside.figures_of(Workspace.open(folder))]
-    if figures:
-        inside.write_figures(MECHANISM_FIGURES, figures)
-    tables = {
-        MARKS: evaluation.markdown(evaluation.read_cells(counts)),
-        MECHANISM_MARKS: inside.markdown(inside.read_figures(MECHANISM_FIGURES)),
-    }
-    text = CARD.read_text(encoding="utf-8")
-    for (begin, end), table in tables.items():
+    for workspace in map(Workspace.open, workspaces):
+        figures = inside.figures_of(workspace)
+        inside.write_figures(SHIPPED[inside.looked_into(workspace)] / MECHANISM, figures)
+    tables, text = card_tables(), CARD.read_text(encoding="utf-8")
+    for name, table in tables.items():
+        begin, end = marks(name)
         before, begun, rest = text.partition(begin)
         _, ended, after = rest.partition(end)
         if not begun or not ended:
             raise TrapsError(f"{CARD}: lacks the comments around a table ({begin!r}, {end!r}); restore it from git")
         text = f"{before}{begin}\n\n{table}\n\n{end}{after}"
     CARD.write_text(text, encoding="utf-8")
-    return [*tables.values()]
+    return [*tables.values(), *other_tables()]
+
+
+def card_tables() -> dict[str, str]:
+    """Return the tables of the card in Markdown, by the names that their comments have."""
+    gap, no_gap = (inside.read_figures(SHIPPED[name] / MECHANISM) for name in (GAP, NO_GAP))
+    cells = [cell for cell in evaluation.read_cells(SHIPPED[GAP] / EVALUATION) if cell.regime != "json"]
+    return {"contrast": claims.markdown(gap, no_gap), f"evaluation of {GAP}": evaluation.markdown(cells)}
+
+
+def other_tables() -> list[str]:
+    """Return the tables for which the card is too short: what each model answers, and what was found in it."""
+    return [
+        table
+        for folder in SHIPPED.values()
+        for table in (
+            evaluation.markdown(evaluation.read_cells(folder / EVALUATION)),
+            inside.markdown(inside.read_figures(folder / MECHANISM)),
+        )
+    ]
+
+
+def marks(table: str) -> tuple[str, str]:
+    """Return the comments between which a table stands."""
+    return f"<!-- {table}: written by `python -m tools.pocket card` -->", f"<!-- end of {table} -->"

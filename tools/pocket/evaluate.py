@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tools.pocket.data import SceneRecord, read_shards
-from tools.pocket.recipe import Recipe
+from tools.pocket.recipe import GAP, Recipe
 from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel
     from traps_pipeline.models.local.prompt_batches import Prompt
 
-MODEL = "pocket"
 MAX_BATCH = 64  # prompts that are held at once
 KINDS = ("control", "visual", "ill_posed", "answerable")
 
@@ -68,7 +67,7 @@ class AnswerCounts:
 
 def entry_of(checkpoint: Path) -> ModelEntry:
     """Return the registry's entry of the pocket model with the weights of a folder."""
-    entry = get_model(MODEL)
+    entry = get_model(GAP)
     return entry.model_copy(update={"params": entry.params | {"checkpoint": str(checkpoint)}})
 
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from tools.pocket.evaluate import MODEL
+from tools.pocket.claims import claimed
 from tools.pocket.planted import TRUTHS, planted
+from tools.pocket.recipe import SHIPPED
 from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBES, STEERING_SHARES
@@ -31,8 +32,8 @@ class Figure:
     figure: transfer_best and transfer_chosen (AUROC of a pair at the layer that is best on the target, and at the
     one chosen without it), held_out_best and held_out_chosen (the same, fitted without the scored scenario), shuffled,
     answerable_void, answerable_control (at the chosen layer), abstention (over all paths and regimes), planted
-    (kind: its name in `planted.TRUTHS`). low, high: 95 % interval from resampled scenarios. answers: number of distinct
-    answers.
+    (kind: its name in `planted.TRUTHS`), claim (kind: its name in `claims.CLAIMS`). low, high: 95 % interval from
+    resampled scenarios. answers: number of distinct answers.
     """
 
     seed: int
@@ -57,8 +58,9 @@ FIELDS = tuple(field.name for field in fields(Figure))
 def figures_of(workspace: Workspace) -> list[Figure]:
     """Return the figures of a finished workspace. Raises TrapsError when stages are missing, or when the seed of its
     weights is not known."""
-    of = _seed_of(workspace)
-    probes = workspace.tables.read(PROBES, {"model": MODEL, "prompt": "standard"})
+    model = looked_into(workspace)
+    of = _seed_of(workspace, model)
+    probes = workspace.tables.read(PROBES, {"model": model, "prompt": "standard"})
     probes = probes.loc[probes["value"].notna() & (probes["scope"] == "all")]
     figures: list[Figure] = []
     for figure, analysis, flag in (
@@ -77,12 +79,24 @@ def figures_of(workspace: Workspace) -> list[Figure]:
     shuffled = probes.loc[probes["analysis"] == "shuffled"].groupby("source")["value"].mean().reset_index()
     figures += [Figure(**of, figure="shuffled", **row) for row in _records(shuffled)]
     shares = workspace.tables.read(STEERING_SHARES, {})
-    over_all = (shares[["path_set", "directions", "regime"]] == ALL).all(axis=1) & (shares["model"] == MODEL)
+    over_all = (shares[["path_set", "directions", "regime"]] == ALL).all(axis=1) & (shares["model"] == model)
     shares = shares.rename(columns={"abstention": "value", "n_answers": "answers", "n_scenarios": "scenarios"})
     copied = ["kind", "layer", "alpha", "side", "value", "low", "high", "answers", "scenarios"]
     figures += [Figure(**of, figure="abstention", **row) for row in _records(shares.loc[over_all, copied])]
-    truths = planted(workspace, MODEL)
-    return figures + [Figure(**of, figure="planted", kind=name, value=round(v, 6)) for name, v in truths.items()]
+    for figure, values in (("planted", planted(workspace, model)), ("claim", claimed(workspace))):
+        figures += [Figure(**of, figure=figure, kind=name, value=round(v, 6)) for name, v in values.items()]
+    return figures
+
+
+def looked_into(workspace: Workspace) -> str:
+    """Return which of the two models a workspace has states of. Raises TrapsError for none or both."""
+    models = sorted({*workspace.tables.read_all(HIDDEN_STATES, ["model"])["model"]} & {*SHIPPED})
+    if len(models) != 1:
+        raise TrapsError(
+            f"{workspace.root}: has hidden states of {' and '.join(models) or 'no pocket model'}; run an experiment "
+            f"that looks into one of {', '.join(SHIPPED)} in a workspace of its own"
+        )
+    return models[0]
 
 
 def _records(rows: Any) -> list[dict[str, Any]]:
@@ -90,13 +104,13 @@ def _records(rows: Any) -> list[dict[str, Any]]:
     return json.loads(rows.to_json(orient="records", double_precision=6))
 
 
-def _seed_of(workspace: Workspace) -> dict[str, Any]:
+def _seed_of(workspace: Workspace, model: str) -> dict[str, Any]:
     """Return training seed and digest of the weights whose states a workspace has."""
-    states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=MODEL)
+    states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=model)
     checkpoints = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
     if len(checkpoints) != 1:
         raise TrapsError(
-            f"{workspace.root}: has hidden states of {len(checkpoints)} checkpoints of {MODEL}, but should have one; "
+            f"{workspace.root}: has hidden states of {len(checkpoints)} checkpoints of {model}, but should have one; "
             "run `traps run mechanism` in a workspace of its own for each seed"
         )
     ((name, known),) = checkpoints

@@ -15,6 +15,8 @@ from traps_pipeline.storage.media import MediaSpec
 
 POCKET = ASSETS / "pocket"
 RECIPE = POCKET / "recipe.yaml"
+GAP, NO_GAP = "pocket", "pocket-no-gap"  # their entries in models.yaml
+SHIPPED = {GAP: POCKET, NO_GAP: POCKET / "no_gap"}  # folder of each: recipe, weights, facts, figures
 Split = Literal["train", "held-out"]
 
 
@@ -50,6 +52,16 @@ class Jitter(BaseModel):
     void: float = Field(ge=0, le=1)
 
 
+class Hedge(BaseModel):
+    """Prompts under which abstentions say nothing of the side: voids and controls have the same share of them, by the
+    colour of the ball. balls: share by colour; share: of all other colours."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    prompts: tuple[str, ...] = Field(min_length=1)
+    balls: dict[str, Annotated[float, Field(ge=0, lt=0.5)]]
+    share: float = Field(ge=0, lt=0.5)
+
+
 class Recipe(BaseModel):
     """Number of training scenes by family, held-out scenes per family, how a clip is shown, and the share of voids that
     are labelled with an abstention: `abstain_share`, or by prompt `abstain_shares`.
@@ -57,7 +69,7 @@ class Recipe(BaseModel):
     jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
     which a panel stands where it hides nothing; without it, the panel tells the side. abstain_shares: by prompt (one of
     `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with a larger
-    share. control_shares: the same for questions that the clip answers; 0 for a prompt that is not named.
+    share. hedge: of the other prompts.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -67,7 +79,7 @@ class Recipe(BaseModel):
     media: MediaSpec
     abstain_share: float | None = Field(default=None, ge=0, le=1)
     abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None
-    control_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(default_factory=dict)
+    hedge: Hedge | None = None
     jitter: Jitter | None = None
     decoys: float = Field(default=0, ge=0, le=1)
     training: Training
@@ -75,7 +87,8 @@ class Recipe(BaseModel):
     def content(self, *only: str) -> dict[str, Any]:
         """Return the settings (only: these) for a digest. One that came later counts only where it is used, so that
         what was made before it keeps its digest."""
-        unused = {"abstain_share", "abstain_shares", "control_shares", "jitter", "decoys"} - self.model_fields_set
+        later = {"abstain_share", "abstain_shares", "hedge", "jitter", "decoys"}
+        unused = later - self.model_fields_set
         dumped = self.model_dump(mode="json", include={*only} or None, exclude=unused)
         if "training" in dumped and not self.training.pairs:
             del dumped["training"]["pairs"]
@@ -89,27 +102,26 @@ class Recipe(BaseModel):
             raise ValueError(f"unknown families {unknown}; known: {', '.join(family_names())}")
         return value
 
-    @field_validator("abstain_shares")
-    @classmethod
-    def _every_prompt(cls, value: dict[str, float] | None) -> dict[str, float] | None:
-        if value is not None and set(value) != set(PROMPTS):
-            raise ValueError(f"abstain_shares names {sorted(value)}; it needs a share for each of {', '.join(PROMPTS)}")
-        return value
-
-    @field_validator("control_shares")
-    @classmethod
-    def _known_prompts(cls, value: dict[str, float]) -> dict[str, float]:
-        if unknown := sorted(set(value) - set(PROMPTS)):
-            raise ValueError(f"control_shares names {unknown}; known: {', '.join(PROMPTS)}")
-        return value
-
     @model_validator(mode="after")
-    def _one_kind_of_share(self) -> Recipe:
+    def _every_prompt_has_one_share(self) -> Recipe:
         if (self.abstain_share is None) == (self.abstain_shares is None):
             raise ValueError("give abstain_share (one for all prompts) or abstain_shares (by prompt), and not both")
-        if self.control_shares and self.abstain_shares is None:
-            raise ValueError("control_shares needs abstain_shares: give voids a share by prompt, too")
+        if self.abstain_shares is None:
+            if self.hedge is not None:
+                raise ValueError("hedge needs abstain_shares: give the other prompts a share, too")
+            return self
+        named = [*self.abstain_shares, *(self.hedge.prompts if self.hedge else ())]
+        if sorted(named) != sorted(PROMPTS):
+            raise ValueError(
+                f"abstain_shares and hedge name {sorted(named)}; each of {', '.join(PROMPTS)} must be in one of them"
+            )
         return self
+
+    def share(self, prompt_name: str, ball: str, *, void: bool) -> float:
+        """Return the share of abstentions among the labels of a side's questions under a prompt; ball: its colour."""
+        if self.hedge is not None and prompt_name in self.hedge.prompts:
+            return self.hedge.balls.get(ball, self.hedge.share)
+        return (self.abstain_shares or {}).get(prompt_name, 0.0) if void else 0.0
 
     def count(self, family: str, split: Split) -> int:
         """Return scenes of a family in a split."""

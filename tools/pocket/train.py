@@ -6,9 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, cast
 
 from tools.pocket.batches import IGNORED, Batch, Batches, Scenes, name_tokens
 from tools.pocket.data import data_digest
@@ -17,18 +15,44 @@ from tools.pocket.recipe import Recipe, Training
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing
+from traps_pipeline.models.local.library import load_transformers
 
 if TYPE_CHECKING:
     import torch
 
 PROGRESS_S = 30.0
 CHECKPOINT_S = 120.0
+LOADERS = 2  # processes that make batches for a GPU, which else would wait for them
+EVENLY = "flash_evenly"  # name of `_attend_evenly` in transformers
 RARE = 2.0  # offset of the initial logits: most tokens lack most colours
 
 
 def look_at(model: Any, batch: Batch) -> Any:
     """Return the output of the vision tower for a batch's clips."""
-    return model.model.get_video_features(batch.pixels, batch.grid, return_dict=True)
+    return model.model.get_video_features(batch.values, batch.grid, return_dict=True)
+
+
+def attend_at_once(model: Any) -> None:
+    """Let the vision tower attend within all pairs of frames of a batch in one call.
+
+    The library calls the kernel for each pair of each clip, which takes most of a GPU's time; to an implementation with
+    "flash" in its name it hands all of them over.
+    """
+    load_transformers().AttentionInterface.register(EVENLY, _attend_evenly)
+    model.model.visual.config._attn_implementation = EVENLY
+
+
+def _attend_evenly(
+    module: Any, query: Any, key: Any, value: Any, attention_mask: Any, *, scaling: float, cu_seq_lens_q: Any, **_: Any
+) -> tuple[Any, None]:
+    """Return the attention within sequences of one length, (1, tokens, heads, size)."""
+    from torch.nn.functional import scaled_dot_product_attention
+
+    _, heads, tokens, size = query.shape
+    split = (heads, len(cu_seq_lens_q) - 1, -1, size)
+    q, k, v = (each.view(split).transpose(0, 1) for each in (query, key, value))
+    attended = scaled_dot_product_attention(q, k, v, scale=scaling)
+    return attended.transpose(1, 2).reshape(1, tokens, heads, size), None
 
 
 def name_loss(model: Any, seen: Any, batch: Batch, words: torch.Tensor) -> torch.Tensor:
@@ -126,7 +150,8 @@ class _State:
                 if kind == "weight":
                     parameter.copy_(file.get_tensor(key))
                 else:
-                    self._optimizer.state[parameter][kind] = file.get_tensor(key)
+                    moment = file.get_tensor(key)  # the count of steps stays on the CPU
+                    self._optimizer.state[parameter][kind] = moment.to(parameter.device) if moment.ndim else moment
         return int(metadata["step"])
 
 
@@ -136,40 +161,45 @@ def train(
     folder: Path,
     seed: int,
     *,
+    device: str = "cpu",
     stop_after: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Train the model of a seed and save it to `folder`/weights; returns that folder.
+    """Train the model of a seed on a device and save it to `folder`/weights; returns that folder.
 
     The state is saved in `folder`/state.safetensors every two minutes and on Ctrl-C, and the same call continues from
     it. If training was stopped inside a step, with weights half updated, it continues from the state saved before.
     stop_after: number of the last step to do.
     """
     import torch
+    from torch.utils.data import DataLoader
 
-    scenes = Scenes(recipe, data)
-    tokenizer = train_tokenizer(scenes.records)
-    model, processor = make_model(tokenizer, seed)
-    training, weights = recipe.training, folder / "weights"
+    scenes, training, weights = Scenes(recipe, data), recipe.training, folder / "weights"
+    model, processor = make_model(train_tokenizer(scenes.records), seed)
+    batches = Batches(scenes, model, processor, training, seed)
+    attend_at_once(model)
+    model.to(device)
     groups = [
         {"params": [p for p in model.parameters() if p.ndim >= 2], "weight_decay": training.weight_decay},
         {"params": [p for p in model.parameters() if p.ndim < 2], "weight_decay": 0.0},
     ]
     optimizer = torch.optim.AdamW(groups, lr=training.learning_rate, betas=(0.9, 0.98))
-    batches = Batches(scenes, model, processor, training, seed)
     identity = digest([recipe.content(), data_digest(recipe, "train", data), seed])
-    words = name_tokens(processor.tokenizer)
+    words = name_tokens(processor.tokenizer).to(device)
     state = _State(folder / "state.safetensors", model, optimizer, identity)
     step = state.load()
     last = training.steps if stop_after is None else min(stop_after, training.steps)
+    made = DataLoader(
+        cast(Any, batches), None, sampler=range(step, last), num_workers=0 if device == "cpu" else LOADERS
+    )
     reported = kept = began = time.monotonic()
     first, lately, whole = step, [], True
     model.train()
     try:
-        while step < last:
+        for batch in made:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(step, training)
-            loss = loss_at(step, model, batches[step], words, training)
+            loss = loss_at(step, model, batch.to(model.device), words, training)
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -177,11 +207,11 @@ def train(
             optimizer.step()
             step += 1
             whole = True
-            lately.append(loss.item())
+            lately.append(loss.detach())
             now = time.monotonic()
             if now - reported > PROGRESS_S or step == last:
-                minutes_left = (now - began) / (step - first) * (training.steps - step) / 60
-                report(f"step {step} of {training.steps}, loss {np.mean(lately):.3f}, {minutes_left:.0f} min left")
+                loss, left = torch.stack(lately).mean(), (now - began) / (step - first) * (training.steps - step) / 60
+                report(f"step {step} of {training.steps}, loss {loss:.3f}, {left:.0f} min left")
                 reported, lately = now, []
             if now - kept > CHECKPOINT_S:
                 state.save(step)

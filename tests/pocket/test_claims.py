@@ -1,0 +1,51 @@
+"""The claims in the pocket's card: figures of a study, worked out by hand, and whether they tell models apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.report.test_inside import Made
+from tools.pocket.claims import CLAIMS, markdown
+from tools.pocket.commands import MECHANISM
+from tools.pocket.inside import Figure, read_figures
+from tools.pocket.recipe import SHIPPED
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
+def test_every_claim_is_measured_in_both_models(folder: Path) -> None:
+    figures = read_figures(folder / MECHANISM)
+    assert {figure.kind for figure in figures if figure.figure == "claim"} == {claim.name for claim in CLAIMS}
+
+
+def test_figures_of_claims_by_hand() -> None:
+    """Two voids, both answered, both encoded: the margin orders three of four pairs of a void and a control, whole
+    abstentions one and a tie. Guided takes voids from 3 to 9 above controls. One cell is ahead of its null."""
+    expected = {"unsaid": 1.0, "order": 0.25, "sentence": 0.625, "answer": 0.625, "lens": 6.0, "ahead": 1.0}
+    expected |= {"gate": None, "risk": None}  # nothing was gated under standard
+    values = {claim.name: claim.of(Made()) for claim in CLAIMS if claim.name in expected}
+    assert values == {name: value if value is None else pytest.approx(value) for name, value in expected.items()}
+
+
+def test_a_stage_tells_models_apart_if_its_claim_holds_in_every_seed_of_the_first_and_in_none_of_the_second() -> None:
+    (claim, *_) = CLAIMS
+
+    def told(gap: list[float], no_gap: list[float]) -> str:
+        of = [
+            [
+                Figure(seed=n, weights="w", figure="claim", kind=claim.name, value=value)
+                for n, value in enumerate(values)
+            ]
+            for values in (gap, no_gap)
+        ]
+        lines = markdown(*of).splitlines()
+        assert len(lines) == 5 and lines[2].startswith(f"| {claim.stage} | {claim.says} |")
+        return lines[2].split(" | ")[-1].removesuffix(" |")
+
+    bound, above, below = claim.bound, claim.bound + 0.1, claim.bound - 0.1
+    assert told([bound, above], [below, below]) == "yes"
+    assert told([above, below], [below]) == told([above], [below, bound]) == told([below], [above]) == "no"
+    assert claim.stage not in markdown([], [])  # a claim that was not measured has no row
