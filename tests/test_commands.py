@@ -43,7 +43,7 @@ RUN_AS = {
     "make ui": ("integration/test_ui.py", '"ui",'),
     "make wheel": ("test_wheel.py", '"hatchling", "build"'),
     **{
-        f"tools.pocket {name}": ("pocket/test_pocket.py", f'main(["{name}",')
+        f"tools.pocket {name}": ("pocket/test_pocket.py", f'main(["{name}"')
         for name in ("render", "train", "evaluate", "card")
     },
 }

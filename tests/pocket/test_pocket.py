@@ -58,11 +58,6 @@ def data(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _guided(recipe: Recipe) -> float:
-    """The share of voids labelled with an abstention under the guided prompt."""
-    return recipe.share("guided", "red", void=True)
-
-
 def _records(job: ShardJob) -> list[SceneRecord]:
     return [SceneRecord.read(line) for line in job.lines.read_text().splitlines()]
 
@@ -162,7 +157,7 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
             {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": question.question}]},
         ]
         text = processor.apply_chat_template(turns, add_generation_prompt=True)
-        said = say(question.label(_guided(recipe)), "guided") + processor.tokenizer.eos_token
+        said = say(scenes.label(look, question, "guided"), "guided") + processor.tokenizer.eos_token
         indices = [round(1000 * time) for time in scenes.times(1, 0)]
         clock = {"fps": 1000.0, "frames_indices": indices, "total_num_frames": indices[-1] + 1}
         inputs = processor(
@@ -231,4 +226,4 @@ def test_the_card_command_needs_the_figures_of_every_model(
 ) -> None:
     monkeypatch.setitem(SHIPPED, GAP, tmp_path)
     assert main(["card"], build_parser()) == 1
-    assert "python -m tools.pocket evaluate" in capsys.readouterr().err
+    assert f"{tmp_path / 'mechanism.csv'}: is not a table of `python -m tools.pocket card" in capsys.readouterr().err
