@@ -9,8 +9,9 @@ import pytest
 from tests.report.test_inside import Made
 from tools.pocket.claims import CLAIMS, markdown
 from tools.pocket.commands import MECHANISM
-from tools.pocket.inside import Figure, read_figures
+from tools.pocket.inside import read_figures
 from tools.pocket.recipe import SHIPPED
+from tools.pocket.seeds import Figure
 
 pytestmark = pytest.mark.slow
 

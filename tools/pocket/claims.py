@@ -20,7 +20,7 @@ from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables.control_reports import prompts
 
 if TYPE_CHECKING:
-    from tools.pocket.inside import Figure
+    from tools.pocket.seeds import Figure
     from traps_pipeline.report.result_frames import Results
     from traps_pipeline.storage.workspace import Workspace
 

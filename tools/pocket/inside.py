@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from tools.pocket.claims import claimed
 from tools.pocket.planted import TRUTHS, planted
 from tools.pocket.recipe import SHIPPED
-from tools.pocket.seeds import write_seeds
+from tools.pocket.seeds import Figure, write_seeds
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.mechanism.shares import ALL
@@ -23,33 +23,6 @@ from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights
 KINDS = ("void", "shuffled", "random")  # of the first weights; later studies rank directions among nulls instead
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A figure of one training seed; columns that do not apply to it are empty.
-
-    figure: transfer_best and transfer_chosen (AUROC of a pair at the layer that is best on the target, and at the
-    one chosen without it), held_out_best and held_out_chosen (the same, fitted without the scored scenario), shuffled,
-    answerable_void, answerable_control (at the chosen layer), abstention (over all paths and regimes), planted
-    (kind: its name in `planted.TRUTHS`), claim (kind: its name in `claims.CLAIMS`). low, high: 95 % interval from
-    resampled scenarios. answers: number of distinct answers.
-    """
-
-    seed: int
-    weights: str
-    figure: str
-    source: str = ""
-    target: str = ""
-    kind: str = ""
-    layer: int | None = None
-    alpha: float | None = None
-    side: str = ""
-    value: float = 0.0
-    low: float | None = None
-    high: float | None = None
-    answers: int | None = None
-    scenarios: int | None = None
 
 
 FIELDS = tuple(field.name for field in fields(Figure))
