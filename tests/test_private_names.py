@@ -7,6 +7,8 @@ import re
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.conftest import ROOT
 
 PACKAGE = ROOT / "traps_pipeline"
@@ -87,6 +89,8 @@ def _attributes(node: ast.AST, here: set[str], everywhere: set[str]) -> list[str
     return [] if node.attr in own else [f"{owner}.{node.attr}"]
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_every_private_name_of_a_library_is_listed_with_its_files() -> None:
     assert private_names(PACKAGE) == {name: set(files.split()) for name, (_, files, _) in PRIVATE.items()}
 

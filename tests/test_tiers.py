@@ -55,6 +55,8 @@ def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
         tiers.of_shard([], shard)
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 @pytest.mark.parametrize(
     ("selection", "complete", "passed", "failed"),
     [

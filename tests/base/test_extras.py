@@ -66,6 +66,7 @@ def test_pylock_holds_the_pins_and_hashes_of_the_lock_and_no_address() -> None:
         assert all(re.fullmatch(r"wheels/[^/]+", file["path"]) for file in files)
 
 
+@pytest.mark.slow
 def test_the_bill_of_materials_names_every_pin_and_is_written_twice_to_the_same_bytes(tmp_path: Path) -> None:
     for out in (tmp_path / "a.json", tmp_path / "b.json"):
         subprocess.run([sys.executable, "tools/sbom.py", out], cwd=ROOT, check=True, capture_output=True)
@@ -100,6 +101,7 @@ def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, 
     assert said in finished.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_an_import_that_nobody_looked_after_is_told_in_the_same_sentence(tmp_path: Path) -> None:
     program = "import runpy; runpy.run_module('tools.pocket', run_name='__main__')"
     code = f"{BLOCK.format(blocked=['torch'])}\nsys.path.insert(0, '.'); {program}"

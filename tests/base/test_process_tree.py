@@ -57,6 +57,7 @@ def tree(tmp_path: Path) -> tuple[subprocess.Popen[bytes], int]:
     return process, int(ready.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("which", "stop"),
     [("first", signal.SIGTERM), ("first", signal.SIGKILL), ("second", signal.SIGHUP), ("second", signal.SIGKILL)],

@@ -97,6 +97,8 @@ def test_the_prior_knows_only_the_commonest_answer_of_a_sub_scenario() -> None:
     assert prior_accuracy(race("yyyn")) == 0.75
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_released_records_carry_evidence_that_holds() -> None:
     specs = list(load_released().values())
     assert unanswerable_controls(specs) == []

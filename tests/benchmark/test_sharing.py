@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from tests.build.stores import opened, where
 from tests.conftest import ROOT
 from traps_pipeline.base.files import write_bytes
@@ -82,6 +84,7 @@ def contents(where: Sequence[str]) -> dict[str, bytes]:
     return {path.name: store.here(path).read_bytes() for path in clips}
 
 
+@pytest.mark.slow
 def test_two_processes_draw_each_row_once(where: Sequence[str], tmp_path: Path) -> None:
     told = tmp_path / "told"
     with process(told, where, "one") as one, process(told, where, "other") as other:
@@ -91,6 +94,7 @@ def test_two_processes_draw_each_row_once(where: Sequence[str], tmp_path: Path) 
     assert not list(tmp_path.rglob(LEASES))
 
 
+@pytest.mark.slow
 def test_what_a_process_that_is_killed_has_finished_is_kept_and_its_row_is_made_by_another(
     where: Sequence[str], tmp_path: Path
 ) -> None:
@@ -108,6 +112,7 @@ def test_what_a_process_that_is_killed_has_finished_is_kept_and_its_row_is_made_
     assert contents(where).keys() == {f"{row['scenario_id']}.mp4" for row in ROWS}
 
 
+@pytest.mark.slow
 def test_what_lies_on_this_host_alone_is_handed_over_and_not_drawn(where: Sequence[str], tmp_path: Path) -> None:
     store, begun = opened(*where, "one"), ROWS[:2]
     for row in begun:

@@ -57,6 +57,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     return shortcuts(pd.DataFrame(items), pd.DataFrame(clips), root)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dataset", "telling", "silent"),
     [

@@ -35,6 +35,7 @@ def test_a_budget_that_is_no_number_is_named(said: str, tmp_path: Path, capsys: 
     assert f"--budget-usd {said}: give dollars" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_words_of_any_kind_in_the_place_of_an_experiment_end_in_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,6 +23,7 @@ def ended(*arguments: str, closed: tuple[str, ...]) -> tuple[int, str, str]:
     return done.returncode, done.stdout or "", done.stderr or ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("init", "demo"), ("models", "check", "oracle")])
 def test_an_output_that_nobody_reads_is_no_failure_and_says_nothing(
     arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -31,6 +32,7 @@ def test_an_output_that_nobody_reads_is_no_failure_and_says_nothing(
     assert ended(*arguments, closed=("stdout",)) == (130, "", "")
 
 
+@pytest.mark.slow
 def test_a_sentence_that_nobody_reads_is_no_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / "study"))
     assert ended("status", closed=("stderr",)) == (130, "", "")
@@ -46,6 +48,7 @@ def test_a_help_or_a_complaint_that_nobody_reads_is_none(
     assert ended(*arguments, closed=("stdout", "stderr")) == (130, "", "")
 
 
+@pytest.mark.slow
 def test_a_command_without_an_output_does_its_work(tmp_path: Path) -> None:
     command = f"{sys.executable} -m traps_pipeline.cli init demo --workspace {tmp_path / 'study'} >&-"
     assert subprocess.run(command, cwd=ROOT, shell=True, check=False).returncode == 0

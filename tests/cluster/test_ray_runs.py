@@ -194,6 +194,7 @@ def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_sta
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, times: int

@@ -68,6 +68,8 @@ def releasable(ledger: Ledger) -> dict[str, Releasable]:
         return Money(ledger.database).releasable()
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_two_processes_use_a_cap_up_to_the_last_worst_case_and_never_pass_it(place: Place) -> None:
     with ExitStack() as running:
         processes = [running.enter_context(place.process(SPEND, name, "10.0", "0.002")) for name in ("one", "two")]
@@ -167,6 +169,7 @@ def test_a_cost_above_the_worst_case_is_spent_and_asked_for_no_more(ledger: Ledg
     assert asyncio.run(run()) == 2.0
 
 
+@pytest.mark.slow
 def test_processes_that_ask_through_an_account_are_counted(place: Place) -> None:
     one, two = place.open().database, place.open().database
     with one.sharing(["openai", "other"]) as of_one:

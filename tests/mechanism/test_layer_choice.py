@@ -37,6 +37,8 @@ def saturated() -> pd.DataFrame:
     return pd.DataFrame(rows).assign(model="m")
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_layer_is_chosen_where_probes_carry_over_although_all_layers_separate_within_a_dataset(
     saturated: pd.DataFrame,
 ) -> None:

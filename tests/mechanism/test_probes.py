@@ -80,6 +80,7 @@ def test_auroc_counts_ties_half_and_takes_many_columns_at_once() -> None:
     assert np.isnan(auroc(np.ones(3, bool), np.arange(3.0)))
 
 
+@pytest.mark.slow
 def test_an_interval_resamples_scenarios_as_a_loop_over_resamples_does() -> None:
     rng = np.random.default_rng(3)
     scenario, void = np.repeat(np.arange(12), 2), np.tile([True, False], 12)
@@ -185,6 +186,7 @@ def rows() -> pd.DataFrame:
     return protocol(items, states, Confabulated(some, {"chaotic": "none there"}))
 
 
+@pytest.mark.slow
 def test_a_planted_signal_is_found_at_its_layer_and_nowhere_else(rows: pd.DataFrame) -> None:
     transfer = rows[rows["analysis"] == "transfer"]
     assert len(transfer) == len(TRANSFER_PAIRS) * LAYERS == 48
@@ -240,6 +242,8 @@ def test_cf_of_shared_controls_is_held_out_by_scenario_too_or_says_that_too_few_
     assert "2 confabulated voids are too few for 5 folds" in two["confabulated_held_out"]["note"].iloc[0]
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_target_label_never_influences_a_fit() -> None:
     """Swapping the sides of a target mirrors its AUROC exactly, and leaves every figure of other targets as it is."""
     items, states = study(pairs=6)

@@ -54,6 +54,7 @@ def test_an_answer_that_stands_in_several_paths_is_one_answer_about_one_scenario
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_its_interval_is_as_wide_as_the_scenarios_are_few() -> None:
     # One scenario of two abstains throughout, in each taxonomy, whatever the number of paths: about what 2 of 4 answers
     # say (0.07 to 0.93); 28 independent answers would have given 0.33 to 0.67.
@@ -71,6 +72,7 @@ def test_of_64_answers_without_an_abstention_the_interval_keeps_a_width() -> Non
     assert one["high"].between(0.03, 0.06).all()  # two taxonomies of 64: less than 1 - 0.025^(1/64) = 0.056 of one
 
 
+@pytest.mark.slow
 def test_undecided_answers_and_the_sweep_are_left_out() -> None:
     answers, votes = study()
     votes["abstained"] = votes["abstained"].astype(object)

@@ -299,6 +299,8 @@ def interrupted(script: str, folder: Path) -> subprocess.Popen[str]:
     return run
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 @pytest.mark.parametrize("stop", STOPS)
 def test_a_stop_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path, stop: signal.Signals) -> None:
     run = interrupted(INTERRUPTED, tmp_path)
@@ -312,6 +314,7 @@ def test_a_stop_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path, 
     assert out == f"{len(rows)} asked\n"
 
 
+@pytest.mark.slow
 def test_what_ends_a_process_by_force_later_gets_a_grace_and_ctrl_c_none(tmp_path: Path) -> None:
     script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.3 if Slow.asked < 6 else 60)")
     script = script.replace("class Slow:", "from traps_pipeline.models import ask\nask.GRACE_S = 1.0\nclass Slow:")
@@ -323,6 +326,7 @@ def test_what_ends_a_process_by_force_later_gets_a_grace_and_ctrl_c_none(tmp_pat
     assert len(rows) == 5 and out in ("6 asked\n", "7 asked\n", "8 asked\n", "9 asked\n")
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.3 if Slow.asked < 5 else 60)")
     run = subprocess.Popen(

@@ -119,6 +119,7 @@ def test_every_released_chaotic_void_is_shorter_than_a_control() -> None:
     assert max(cuts) < CUT_FRAMES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", ["stack-0001", "transfer-0001", "topple-0001"])  # dark blue specks, no panel
 def test_the_panel_is_seen_in_an_occlusion_void_and_not_in_its_control(tmp_path: Path, scenario_id: str) -> None:
     case = load(scenario_id)

@@ -71,6 +71,8 @@ def unsent(capsys: pytest.CaptureFixture[str], base_url: str, timeout_s: float =
 WORST_USD = worst_case_usd(entry_of(MODEL), request())
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_refused_connection_a_name_that_is_none_and_a_scheme_that_is_none_cost_nothing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -197,6 +199,8 @@ def test_a_call_that_is_cancelled_is_billed_once_it_was_sent_and_not_in_a_handsh
     assert asyncio.run(run()) == pytest.approx(worst_cases * WORST_USD)
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_time_out_is_billed_where_the_call_was_sent_and_not_where_no_connection_was_made(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -22,6 +22,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_dagsters_own_storage_reads_every_event(home: Path) -> None:
     with dg.DagsterInstance.from_config(str(home)) as instance:
         run = dg.materialize([answer], instance=instance)
@@ -45,6 +46,7 @@ def test_each_commit_touches_the_file_that_a_page_watches(home: Path) -> None:
     assert touched == sorted(set(touched))
 
 
+@pytest.mark.slow
 def test_threads_that_write_at_once_lose_nothing(home: Path) -> None:
     keys = [dg.AssetKey(f"of_thread_{number}") for number in range(4)]
     with dg.DagsterInstance.from_config(str(home)) as instance:

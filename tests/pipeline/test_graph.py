@@ -38,6 +38,8 @@ def parents(stage: str, key: str | None) -> set[tuple[str, str | None]]:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_partition_is_made_from_what_dagster_says() -> None:
     for stage in STAGES:
         keys = GRAPH.keys(stage)

@@ -34,6 +34,7 @@ def expanded(keys: Sequence[str]) -> Counter[str]:
     return ran
 
 
+@pytest.mark.slow
 def test_batches_of_any_cells_run_each_once_and_no_other() -> None:
     rng = random.Random(7)
     for size in [1, 2, 3, 5, 10, 30, len(CELLS) // 2, len(CELLS) - 1] * 3:
@@ -59,6 +60,8 @@ def test_neighbours_of_one_dimension_are_one_range_and_no_keys_are_no_run() -> N
     assert list(batches(None, [None])) == [(None, None)]
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 @pytest.mark.parametrize("damage", ["gone", "no database"])
 def test_a_history_that_is_lost_begins_anew(
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -73,6 +73,7 @@ def test_every_figure_of_the_papers_text_stands_on_some_card_with_its_line() -> 
     assert ["", "agreement of the two annotators pooled over the axes", "375/400 = 93.8%", "1784"] in shown
 
 
+@pytest.mark.slow
 def test_recomputed_tables_stand_apart_from_the_printed_ones() -> None:
     paper = PublishedResults()
     recomputed = {table.name: table for report in TABLE_REPORTS for table in report.tables(paper)}

@@ -117,6 +117,7 @@ def shown(table, **values):
     return dict(zip([column.heading for column in table.columns], table.cells[at], strict=True))
 
 
+@pytest.mark.slow
 def test_a_model_whose_every_call_failed_is_a_row_of_dashes_and_breaks_no_page(broken, broken_tables):
     uplift = broken_tables["guided_uplift"]
     row = shown(uplift, model=BROKEN)
@@ -157,6 +158,7 @@ def test_what_the_contrasts_refuse_item_by_item_is_in_no_other_comparison(broken
     assert f"{SPEAKS}: chaotic: 3 items" in uplift.notes
 
 
+@pytest.mark.slow
 def test_figures_over_all_datasets_are_of_the_runs_that_have_them_all(tmp_path):
     # A second run of `chaotic` alone moves that cell, and no figure that is overall.
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
@@ -186,6 +188,7 @@ def texts(table):
     return [" ".join(row) for row in table.cells]
 
 
+@pytest.mark.slow
 def test_the_published_analyses_are_the_papers():
     uplift = {row[0]: row for row in recomputed()["guided_uplift"].cells}
     assert uplift["gpt-5-mini"][1:4] == ["3.1", "34.0", "11.07"]
@@ -200,6 +203,8 @@ def test_the_published_analyses_are_the_papers():
     ]
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_every_published_table_is_well_formed_in_every_medium():
     assert len([name for name in by_name() if name.startswith("expanded_")]) == 12
     for table in (*by_name().values(), *recomputed().values()):
@@ -211,6 +216,7 @@ def test_every_published_table_is_well_formed_in_every_medium():
         assert not re.search(r"\bnan\b|<NA>", files[f"{table.name}.md"].decode())
 
 
+@pytest.mark.slow
 def test_an_empty_study_says_not_run_and_never_zero(empty):
     for report in TABLE_REPORTS:
         for table in report.tables(empty):
@@ -220,6 +226,7 @@ def test_an_empty_study_says_not_run_and_never_zero(empty):
                 assert table.absence.startswith("not run"), table.name
 
 
+@pytest.mark.slow
 def test_a_partial_study_says_what_is_missing(partial):
     tables = {table.name: table for report in TABLE_REPORTS for table in report.tables(partial)}
     assert [row[0] for row in tables["overall"].cells] == ["oracle"]
@@ -246,6 +253,7 @@ def overhang(figure):
     return max(-drawn.x0, -drawn.y0, drawn.x1 - width, drawn.y1 - height)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("report", FIGURE_REPORTS, ids=lambda report: report.name)
 def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, empty):
     from matplotlib.text import Text
@@ -302,6 +310,8 @@ def test_the_page_of_the_docs_names_every_table_and_figure():
         assert [report.name for report in reports if report.name not in named] == []
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch, capsys):
     chosen = [next(r for r in FIGURE_REPORTS if r.name == "doubt_conversion")]
     monkeypatch.setattr(publish, "FIGURE_REPORTS", chosen)
@@ -320,6 +330,7 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     assert "not run: this study has no leaderboard yet" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_numbers_are_numbers_in_every_exported_file(partial):
     number = re.compile(r"[+−-]?(\d+(\.\d*)?|\.\d+)%?")
     for results in (partial, PAPER):

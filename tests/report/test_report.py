@@ -109,6 +109,7 @@ def cells_with_gaps(model="gaps"):
     ]
 
 
+@pytest.mark.slow
 def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
     board = board_of(*cells_with_gaps(), *(board_row("whole", dataset=d, shares=(1, 0, 1)) for d in BOARDS))
     assert entry(board, "whole").items() >= {
@@ -120,6 +121,7 @@ def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
     }.items()  # fmt: skip
 
 
+@pytest.mark.slow
 def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
     board = board_of(*cells_with_gaps())
     marked = {heading for heading, cell in entry(board, "gaps").items() if "‡" in cell}
@@ -175,6 +177,8 @@ def test_null_figures_are_dashes_and_negative_ones_have_a_true_minus():
     assert "nan" not in leaderboard_text(board) + leaderboard_markdown(board) + report_html(board)
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_a_hostile_model_id_is_text_in_every_medium(board):
     for shown in (board, board_of(*cells_with_gaps(HOSTILE))):
         markdown, page = leaderboard_markdown(shown), report_html(shown)
@@ -185,6 +189,7 @@ def test_a_hostile_model_id_is_text_in_every_medium(board):
         assert "\x1b" not in leaderboard_text(shown)
 
 
+@pytest.mark.slow
 def test_html_asks_the_network_for_nothing(board):
     svg = figure_bytes(landscape_figure(points(board), "Overall"), "svg")
     card = Card("figure-x", "A figure", f'<img src="{data_address("svg", svg)}">')

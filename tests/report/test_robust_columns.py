@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from tests.build.boards import board_of, board_row
 from tests.build.cells import row
@@ -30,6 +31,7 @@ def shown(robust: pd.DataFrame | None, board: pd.DataFrame = BOARD) -> list[str]
     return [leaderboard_text(board, robust), leaderboard_markdown(board, robust), report_html(board, robust=robust)]
 
 
+@pytest.mark.slow
 def test_without_any_arm_the_leaderboard_is_what_it_was_byte_for_byte() -> None:
     before = [leaderboard_text(BOARD), leaderboard_markdown(BOARD), report_html(BOARD)]
     assert shown(None) == shown(robust_of().iloc[:0]) == before

@@ -39,6 +39,7 @@ def test_the_page_has_the_table_of_arms():
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_partners_refute_each_others_question_and_nobody_has_two():
     specs = load_released()
     by_family = [[spec for spec in specs.values() if spec.family == family] for family in ("plinko", "hidden_race")]

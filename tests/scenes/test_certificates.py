@@ -63,6 +63,7 @@ def failures(case: Released, spec: SceneSpec) -> dict[str, str]:
     return dict(certify(spec, case.qpos, case.twin, frame_step=10).failures)
 
 
+@pytest.mark.slow
 def test_a_lowered_panel_hides_nothing_and_betrays_the_twin(race: Released) -> None:
     panel = dict(race.spec.void["panel"])
     x, y, z = panel["centre"]
@@ -92,12 +93,14 @@ def test_a_panel_that_rises_over_the_flags_hides_what_the_question_names() -> No
     assert measured["raised"]["panel_covers"] >= measured["released"]["panel_covers"] > 0
 
 
+@pytest.mark.slow
 def test_a_changed_answer_is_not_what_the_control_shows(race: Released) -> None:
     other = next(label for label in race.spec.labels if label != race.spec.ground_truth)
     found = failures(race, altered(race.spec, ground_truth=other))
     assert f"the control shows {race.spec.ground_truth!r}" in found["outcome"]
 
 
+@pytest.mark.slow
 def test_another_hidden_element_is_not_the_scene_of_the_trajectory(race: Released) -> None:
     lanes = len(race.spec.params["colours"])
     params = race.spec.params | {"clear_lane": (race.spec.params["clear_lane"] + 1) % lanes}
@@ -106,6 +109,7 @@ def test_another_hidden_element_is_not_the_scene_of_the_trajectory(race: Release
     assert "simulated here, the scene ends in" in found["physics"]
 
 
+@pytest.mark.slow
 def test_a_twin_that_differs_in_what_is_seen_is_no_twin(race: Released) -> None:
     assert race.spec.twin.params is not None
     other = next(colour for colour in ("wood", "grey") if colour != race.spec.twin.params["deck_colour"])
@@ -114,6 +118,7 @@ def test_a_twin_that_differs_in_what_is_seen_is_no_twin(race: Released) -> None:
     assert "more, or in less, than the hidden element" in failures(race, altered(race.spec, twin=twin))["twin"]
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_away_loses_the_scene(race: Released) -> None:
     camera = race.spec.camera | {"distance": race.spec.camera["distance"] / 2}
     assert "in_frame" in failures(race, altered(race.spec, camera=camera))
@@ -151,6 +156,8 @@ def test_an_order_that_two_frames_a_second_do_not_show_is_lost(race: Released) -
     assert ORDER.contradiction(seen(None), race.spec.evidence, exact=False) is not None
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_an_answerable_question_is_not_ill_posed(race: Released) -> None:
     found = failures(race, altered(race.spec, ill_posed_question="Which ball is in front?"))
     assert "nothing shows that 'Which ball is in front?' has no answer" in found["words"]
@@ -158,6 +165,7 @@ def test_an_answerable_question_is_not_ill_posed(race: Released) -> None:
     assert "reads as ill-posed: mass" in found["words"]
 
 
+@pytest.mark.slow
 def test_physics_that_differs_in_the_last_bits_is_told_and_changes_no_verdict(race: Released) -> None:
     nudged = race.qpos + np.float32(1e-7)
     spec = altered(race.spec, trajectory_sha256=trajectory_digest(nudged))
@@ -176,6 +184,7 @@ def test_an_outcome_that_settles_at_the_end_or_by_less_than_the_familys_margin_i
             settled_outcome(family, replay(model, race.qpos[:frames], race.physics), race.params)
 
 
+@pytest.mark.slow
 def test_a_margin_that_is_not_the_records_is_refused(race: Released) -> None:
     margin = race.spec.evidence["margin_m"]
     wider = altered(race.spec, evidence=race.spec.evidence | {"margin_m": round(margin + 1e-5, 5)})
@@ -402,6 +411,7 @@ def test_another_twin_start_that_leads_elsewhere_is_no_fault_of_a_record_on_anot
 # --- adding one -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_page(
     race: Released, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -96,6 +96,7 @@ def failure(scenario_id: str, spec: SceneSpec) -> str | None:
     return CLOSING.failure({**spec.evidence, **CLOSING.measured(pair)}, pair.claim)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", [BOARD, "chain-0001"])
 def test_a_released_control_is_closed_and_one_that_closes_too_early_or_too_late_is_found(scenario_id: str) -> None:
     spec = load_released()[scenario_id]

@@ -157,6 +157,7 @@ def test_the_first_picture_that_a_renderer_draws_of_a_scene_with_textures_is_as_
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_a_record_without_its_look_is_given_the_look_of_its_draw(tmp_path: Path) -> None:
     (tmp_path / "trajectories").mkdir()
     shutil.copy(RELEASED / "trajectories" / "plinko-0001.npz", tmp_path / "trajectories")

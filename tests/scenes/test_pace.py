@@ -38,6 +38,7 @@ def test_an_early_outcome_ends_the_clip_after_a_second_and_six_tenths_more_and_b
     assert all(settles_share(8, n) >= 0.3 for each in found for n in each)
 
 
+@pytest.mark.slow
 def test_an_outcome_that_is_not_early_leaves_the_clip_as_long_as_it_is() -> None:
     world = whole(LATE)
     assert world.outcome.commit_frame >= 15

@@ -63,6 +63,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_why_draws_are_rejected_is_said_at_the_first_draw_of_a_kind(tmp_path: Path) -> None:
     said: list[str] = []
 

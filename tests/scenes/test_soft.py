@@ -40,6 +40,7 @@ print(model.body_mass.tobytes().hex(), model.flex_stiffness.tobytes().hex())
 """
 
 
+@pytest.mark.slow
 def test_a_soft_ball_is_the_same_to_the_last_bit_whatever_a_process_built_before() -> None:
     built = [
         subprocess.run([sys.executable, "-c", BUILD, *radii], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -36,6 +36,8 @@ def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
     return {name: one.frame for name, one in made.items()} | frames | {"votes": votes.loc[:, VOTE_COLUMNS]}
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_rows_of_arms_beside_the_pairs_change_no_figure(
     rows: Rows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

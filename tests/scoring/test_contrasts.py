@@ -109,6 +109,7 @@ def test_more_comparisons_need_more_scenarios(rows):
     assert scored(*parts)[2]["separable"].isna().all()
 
 
+@pytest.mark.slow
 def test_twenty_three_models_that_lie_well_apart_are_all_told_apart(rows):
     # 253 pairs: 2 / (resamples + 1), the least that counting can say, times 253 would be above 0.05 even for 10,000.
     parts = [rows(pairs_with(460, 20 * k, 0, 460), model=f"m{k:02d}") for k in range(23)]

@@ -42,6 +42,7 @@ ANSWERS = {
 }
 
 
+@pytest.mark.slow
 def test_two_judges_decide_where_they_agree_and_leave_open_where_they_do_not(tmp_path) -> None:
     verdicts, votes = study(ANSWERS)
     rows = leave_one_out(verdicts, votes, board(verdicts)).set_index("without")
@@ -67,6 +68,7 @@ def test_of_every_three_votes_the_other_two_decide_only_together() -> None:
         assert [None if pd.isna(said) else said for said in found] == [{"yy": True, "nn": False}.get(o) for o in others]
 
 
+@pytest.mark.slow
 def test_runs_are_averaged_and_overall_needs_all_four_datasets() -> None:
     parts = [study(ANSWERS, dataset=d, run=run) for run in (1, 2) for d in ("occlusion", "chaotic")]
     verdicts, votes = (pd.concat(frames, ignore_index=True) for frames in zip(*parts, strict=True))

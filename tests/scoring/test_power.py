@@ -34,6 +34,7 @@ def test_a_model_that_never_varies_has_a_width_all_the_same() -> None:
     assert 0.1 < precision(everywhere(16), Shares(1.0, 1.0, 0.0)).width < 0.5
 
 
+@pytest.mark.slow
 def test_more_models_need_a_larger_difference_and_too_few_scenarios_find_none() -> None:
     two, many = precision(everywhere(100)), precision(everywhere(100), models=16)
     assert two.difference == two.among_all == many.difference
@@ -41,6 +42,7 @@ def test_more_models_need_a_larger_difference_and_too_few_scenarios_find_none() 
     assert precision({"occlusion": 12}, models=16).among_all is None  # 120 x 2^-11 > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shares", [Shares(), Shares(0.8, 0.9, 0.05), Shares(0.4, 0.5, 0.25), Shares(0.5, 0.5, 0.5), Shares(0.8, 0.2, 0.2)]
 )
@@ -59,6 +61,8 @@ def test_the_promised_width_is_within_15_percent_of_the_bootstraps(shares: Share
     assert np.mean(widths) == pytest.approx(precision(everywhere(n), shares).width, rel=0.15)
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_the_plan_names_the_difference_that_all_models_of_the_experiment_leave(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -161,6 +161,7 @@ def test_frames_are_picked_by_time_stamp_not_by_number() -> None:
     assert pick(times, VIDEO).tolist() == [0, 2, 4, 5]  # wanted: 0, 0.2 (0.19 and 0.21 equally near), 0.4, 0.6
 
 
+@pytest.mark.slow
 def test_a_sample_is_the_decoded_frames_with_their_times(clip: tuple[Path, str]) -> None:
     whole, times = decode(clip[0])
     for spec in (VIDEO, IMAGES):
