@@ -38,14 +38,16 @@ class _Strict(BaseModel):
 
 
 class Commitment(_Strict):
-    """What is published first. draws: scenarios by family. seed: digest of the seed. specs: digest of each record.
-    made_with: machine and libraries, of which the arithmetic of a draw may depend."""
+    """What is published first. draws: scenarios by family. look: the parts of the look that were drawn, by family.
+    seed: digest of the seed. specs: digest of each record. made_with: machine and libraries, on which the arithmetic
+    of a draw depends."""
 
     format: Literal[1] = 1
     name: str
     version: str
     canary: str
     draws: dict[str, int]
+    look: dict[str, list[str]] = {}
     seed: str = Field(pattern=_HEX)
     specs: dict[str, str] = Field(min_length=1)
     made_with: dict[str, str]
@@ -84,6 +86,7 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     published = Commitment(
         **release.model_dump(include={"name", "version", "canary"}),
         draws=draws,
+        look={name: tally.look for name, tally in sorted(tallies.items())},
         seed=_sealed_seed(secret, draws),
         specs={id_: _sealed_spec(secret, spec) for id_, spec in sorted(specs.items())},
         made_with=_made_with(),
@@ -174,7 +177,15 @@ def drawn_again(
             for family, count in commitment.draws.items():
                 report(f"drawing {count} of {family} again")
                 try:
-                    sample_family(family, count, reveal.seed, Path(folder) / "released", workers=workers, report=report)
+                    sample_family(
+                        family,
+                        count,
+                        reveal.seed,
+                        Path(folder) / "released",
+                        look=commitment.look.get(family, ()),
+                        workers=workers,
+                        report=report,
+                    )
                 except (RuntimeError, KeyError) as error:
                     raise TrapsError(
                         f"{family}: the seed does not give {count} scenarios here ({plain(error)})"
