@@ -53,6 +53,12 @@ def test_dagster_knows_the_stages_and_sources_that_are_declared_and_no_others() 
     assert {key.to_user_string() for key in DAGSTER.get_all_asset_keys()} == {*STAGES, *GRAPH.sources}
 
 
+def test_a_description_tells_what_an_asset_is_and_not_what_its_function_does() -> None:
+    assert GRAPH["items"].doc.startswith("The items that models are asked, ")
+    for name in STAGES:
+        assert not GRAPH[name].doc.startswith("Return") and GRAPH[name].doc[:1].isupper(), name
+
+
 def test_a_block_shares_its_partitions_and_blocks_are_few() -> None:
     for block in GRAPH.blocks():
         assert len({id(stage.scheme) for stage in block}) == 1
