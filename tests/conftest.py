@@ -164,8 +164,11 @@ def copy_workspace(source: Path, target: Path) -> None:
 def pytest_sessionstart() -> None:
     """What tests start is stopped by signals, also where this run was itself started in the background.
 
-    Tests count what they render: only studies that are made once a run take clips from the cache of this machine.
+    Tests count what they render: only studies that are made once a run take clips from the cache of this machine. The
+    study that the shell's environment names is no test's: its keys would be the partitions of the whole run.
     """
+    for name in ("TRAPS_WORKSPACE", "DAGSTER_HOME"):
+        os.environ.pop(name, None)
     os.environ["TRAPS_CLIP_CACHE"] = "off"
     for stop in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(stop) is signal.SIG_IGN:

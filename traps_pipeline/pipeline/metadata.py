@@ -15,7 +15,7 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
-PREVIEWED = 5  # rows
+PREVIEWED, SHORT = 5, 24  # rows, and characters of a text that is shown in them
 RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
 
@@ -67,7 +67,14 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
         samples = {
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
-    names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
+    shown = [row for rows in samples.values() for row in rows]
+    names = [
+        c.name
+        for c in table.columns
+        if c.name in table.key
+        or c.type in (int, float, bool)
+        or 0 < max((len(text) for row in shown if isinstance(text := row.get(c.name), str)), default=0) <= SHORT
+    ]
     tables = {
         title: [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows] for title, rows in samples.items()
     }
