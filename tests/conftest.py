@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = "tests/experiments/small.yaml"  # of the small study, relative to a checkout
 SMALL = ROOT / EXPERIMENT
 CLIP_CACHE = os.environ.get("TRAPS_CLIP_CACHE", "")  # of the user, for studies that are made once a run
+for named in ("TRAPS_WORKSPACE", "DAGSTER_HOME"):  # by a shell, as the README has it: its keys would be all partitions
+    os.environ.pop(named, None)
 KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"  # of the test provider
 
 
@@ -164,11 +166,8 @@ def copy_workspace(source: Path, target: Path) -> None:
 def pytest_sessionstart() -> None:
     """What tests start is stopped by signals, also where this run was itself started in the background.
 
-    Tests count what they render: only studies that are made once a run take clips from the cache of this machine. The
-    study that the shell's environment names is no test's: its keys would be the partitions of the whole run.
+    Tests count what they render: only studies that are made once a run take clips from the cache of this machine.
     """
-    for name in ("TRAPS_WORKSPACE", "DAGSTER_HOME"):
-        os.environ.pop(name, None)
     os.environ["TRAPS_CLIP_CACHE"] = "off"
     for stop in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(stop) is signal.SIG_IGN:
