@@ -77,6 +77,20 @@ def test_what_would_read_a_damaged_table_names_it_and_the_remedy_before(study: W
     assert Lineage(study).blocked("metrics", "chaotic", current=False) == told + remedy
 
 
+def test_a_damaged_table_waits_for_nothing_but_what_is_above_it(study: Workspace) -> None:
+    study.tables.write(ITEMS, {"dataset": "chaotic"}, [], {}, code=the_graph()["items"].code)
+    for model in ("prior", "oracle"):
+        decide(study, CELL | {"model": model}, abstained=True)
+    path = study.tables.path(METRICS, {"dataset": "chaotic"})
+    path.write_bytes(path.read_bytes()[:-20])
+    assert status(study).kind == "stale" and "it was altered" in status(study).reasons[0]
+    assert not Lineage(study).waits("metrics", "chaotic")  # the sensor makes it anew
+    path.unlink()
+    cell = study.tables.path(VERDICTS, CELL)
+    cell.write_bytes(cell.read_bytes()[:-20])
+    assert Lineage(study).waits("metrics", "chaotic")
+
+
 def test_another_formula_makes_metrics_stale(study: Workspace) -> None:
     score(study, "another")
     [reason] = status(study).reasons

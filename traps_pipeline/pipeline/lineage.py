@@ -142,6 +142,8 @@ class Lineage:
 
     def _state(self, name: str, key: str | None) -> State | None:
         stage = self.graph[name]
+        if self.damage(name, key):
+            return None  # what a damaged file says of itself is not believed
         if stage.table is not None:
             return self._workspace.tables.state(stage.table, stage.columns(key))
         return read_report_state(self._workspace, stage)
