@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = "tests/experiments/small.yaml"  # of the small study, relative to a checkout
 SMALL = ROOT / EXPERIMENT
 CLIP_CACHE = os.environ.get("TRAPS_CLIP_CACHE", "")  # of the user, for studies that are made once a run
+for named in ("TRAPS_WORKSPACE", "DAGSTER_HOME"):  # by a shell, as the README has it: its keys would be all partitions
+    os.environ.pop(named, None)
 KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"  # of the test provider
 
 

@@ -10,7 +10,6 @@ from traps_pipeline.pipeline.automation import jobs, sensors
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.schemes import study_here
 from traps_pipeline.storage.several_hosts import several_hosts
-from traps_pipeline.storage.workspace import Workspace
 
 redact_tracebacks()
 require_root()
@@ -27,5 +26,5 @@ defs = dg.Definitions(
     jobs=jobs(),
     sensors=_sensors(),
     executor=dg.in_process_executor,
-    resources={"workspace": WorkspaceResource(root=str(Workspace.default_place()))},
+    resources={"workspace": WorkspaceResource()},
 )

@@ -17,6 +17,7 @@ import pytest
 
 from tests.build.processes import MARK, marked, wait_until_gone
 from tests.conftest import ROOT, Checkout
+from traps_pipeline.pipeline.webserver import AGAIN
 
 pytestmark = pytest.mark.slow
 START_S, END_S = 600, 120  # nine times what a busy machine of two cores takes
@@ -84,6 +85,9 @@ def test_no_process_of_the_pages_outlives_the_command(background: Background, st
     assert background.answers()
     os.kill(pid, stop)
     wait_until_gone(background.mark, END_S)
+    told = background.log.read_text()
+    assert told.index("starting Dagster") < told.index(f"http://127.0.0.1:{background.port}/?token={TOKEN}")
+    assert AGAIN in told
 
 
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGKILL])

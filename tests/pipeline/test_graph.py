@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
 
 import dagster as dg
 import pytest
@@ -14,6 +15,8 @@ from traps_pipeline.definitions import defs
 from traps_pipeline.pipeline import stage as declaration
 from traps_pipeline.pipeline.graph import JOB_GROUPS, the_graph
 from traps_pipeline.storage.parquet import StageOutput
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 DAGSTER = defs.get_repository_def().asset_graph
 GRAPH = the_graph()
@@ -51,6 +54,21 @@ def test_a_partition_is_made_from_what_dagster_says() -> None:
 
 def test_dagster_knows_the_stages_and_sources_that_are_declared_and_no_others() -> None:
     assert {key.to_user_string() for key in DAGSTER.get_all_asset_keys()} == {*STAGES, *GRAPH.sources}
+
+
+def test_a_description_tells_what_an_asset_is_and_not_what_its_function_does() -> None:
+    assert GRAPH["items"].doc.startswith("The items that models are asked, ")
+    for name in STAGES:
+        assert not GRAPH[name].doc.startswith("Return") and GRAPH[name].doc[:1].isupper(), name
+
+
+def test_a_run_works_in_the_study_of_the_environment_also_in_a_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("study", "copy"):
+        Workspace.create(tmp_path / name, Study())
+        monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / name))
+        assert (defs.resources or {})["workspace"].open().root == tmp_path / name
 
 
 def test_a_block_shares_its_partitions_and_blocks_are_few() -> None:

@@ -12,6 +12,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage, Status
 from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -63,6 +64,31 @@ def test_a_cell_that_joins_makes_metrics_stale(study: Workspace) -> None:
 def test_a_table_that_is_gone_makes_metrics_stale(study: Workspace) -> None:
     study.tables.path(VERDICTS, CELL).unlink()
     assert status(study) == Status("stale", (f"{NAME} is gone",))
+
+
+def test_what_would_read_a_damaged_table_names_it_and_the_remedy_before(study: Workspace) -> None:
+    study.tables.write(ITEMS, {"dataset": "chaotic"}, [], {}, code=the_graph()["items"].code)
+    decide(study, CELL | {"model": "oracle"}, abstained=True)
+    assert Lineage(study).blocked("metrics", "chaotic", current=False) == ""
+    path = study.tables.path(VERDICTS, CELL)
+    path.write_bytes(path.read_bytes()[:-20])
+    told = f"{NAME} is damaged: {path}: is not what was written (it was altered); "
+    remedy = "materialize verdicts for this partition again"
+    assert Lineage(study).blocked("metrics", "chaotic", current=False) == told + remedy
+
+
+def test_a_damaged_table_waits_for_nothing_but_what_is_above_it(study: Workspace) -> None:
+    study.tables.write(ITEMS, {"dataset": "chaotic"}, [], {}, code=the_graph()["items"].code)
+    for model in ("prior", "oracle"):
+        decide(study, CELL | {"model": model}, abstained=True)
+    path = study.tables.path(METRICS, {"dataset": "chaotic"})
+    path.write_bytes(path.read_bytes()[:-20])
+    assert status(study).kind == "stale" and "it was altered" in status(study).reasons[0]
+    assert not Lineage(study).waits("metrics", "chaotic")  # the sensor makes it anew
+    path.unlink()
+    cell = study.tables.path(VERDICTS, CELL)
+    cell.write_bytes(cell.read_bytes()[:-20])
+    assert Lineage(study).waits("metrics", "chaotic")
 
 
 def test_another_formula_makes_metrics_stale(study: Workspace) -> None:

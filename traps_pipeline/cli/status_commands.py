@@ -37,7 +37,9 @@ def add(commands: Commands) -> None:
 def status(arguments: argparse.Namespace) -> int:
     """See `traps status --help`."""
     workspace = open_workspace(arguments)
-    experiment = experiment_of(arguments).name if arguments.experiment else None
+    experiment = arguments.experiment
+    if experiment is not None and experiment not in workspace.study.experiments:  # a file, or a misspelt name
+        experiment = experiment_of(arguments).name
     if experiment is not None and experiment not in workspace.study.experiments:
         raise TrapsError(
             f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
@@ -80,9 +82,9 @@ def _command(workspace: Workspace, experiment: str | None) -> str:
     """Return the command that makes what is not fresh: of the experiment that was given, or of the study's only one."""
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
-    names = [name for name in workspace.study.experiments if (EXPERIMENTS / f"{name}.yaml").exists()]
-    is_only = len(names) == len(workspace.study.experiments) == 1
-    return f"traps run {experiment or (names[0] if is_only else 'EXPERIMENT')}"
+    given = [experiment] if experiment else [*workspace.study.experiments]
+    files = [name for name in given if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
+    return f"traps run {files[0] if len(files) == len(given) == 1 else 'EXPERIMENT'}"
 
 
 def why(arguments: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 
 from traps_pipeline.base.extras import require
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, number, open_workspace, whole
@@ -39,6 +40,7 @@ def ui(arguments: argparse.Namespace) -> int:
     token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
         return code if code >= 0 else FAILED
+    print("starting Dagster; the address to open follows", file=sys.stderr)
     from traps_pipeline.pipeline.run import dagster_history
     from traps_pipeline.storage.workspace import RUN_CPUS, RUN_GPUS
 

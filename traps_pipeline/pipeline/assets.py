@@ -11,7 +11,6 @@ from traps_pipeline.pipeline.graph import Graph, Source, Stage
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
 from traps_pipeline.pipeline.step import Event, guarded, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
-from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -19,9 +18,12 @@ OWNERS = ["team:benchmark"]
 
 
 class WorkspaceResource(dg.ConfigurableResource):
-    """The study that a run works in."""
+    """The study that a run works in: the one whose partitions are loaded.
 
-    root: str
+    It is no configuration. A run keeps its configuration, and done again in a copy of the study it would work in the
+    study that was copied.
+    """
+
     _steps: ExitStack = PrivateAttr(default_factory=ExitStack)
 
     def until_torn_down(self, events: Generator[Event, None, None]) -> Iterator[Event]:
@@ -39,7 +41,7 @@ class WorkspaceResource(dg.ConfigurableResource):
 
     def open(self) -> Workspace:
         """Return the workspace. Raises TrapsError naming the remedy where there is none."""
-        return Workspace.open(place_of(self.root))
+        return Workspace.open()
 
 
 def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:

@@ -89,7 +89,9 @@ class Lineage:
             wanted = [k for k in keys if k in self._wanted(parent)]
             wrong = {k: why for k in wanted if (why := self._unusable(parent, k, current))}
             need = stage.parents[parent].need
-            if need != "none" and wrong and (need == "every" or len(wrong) == len(wanted)):
+            if need == "none" or (need == "some" and len(wrong) < len(wanted)):
+                wrong = {k: why for k, why in wrong.items() if self.damage(parent, k)}  # it would be read with the rest
+            if wrong:
                 first, why = next(iter(wrong.items()))
                 more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
                 return f"{name_of((parent, first))} {why}{more}"
@@ -120,7 +122,7 @@ class Lineage:
 
     def _unusable(self, name: str, key: str | None, current: bool) -> str:
         if damage := self.damage(name, key):
-            return f"is damaged: {damage}; materialize {name} for it again"
+            return f"is damaged: {damage.partition('; ')[0]}; materialize {name} for this partition again"
         status = self.status(name, key)
         if status.kind == "missing":
             return f"is not made; materialize {name} for this partition first"
@@ -140,6 +142,8 @@ class Lineage:
 
     def _state(self, name: str, key: str | None) -> State | None:
         stage = self.graph[name]
+        if self.damage(name, key):
+            return None  # what a damaged file says of itself is not believed
         if stage.table is not None:
             return self._workspace.tables.state(stage.table, stage.columns(key))
         return read_report_state(self._workspace, stage)

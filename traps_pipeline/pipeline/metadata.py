@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, cast
 
@@ -15,7 +15,7 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
-PREVIEWED = 5  # rows
+PREVIEWED, SHORT = 5, 24  # rows, and characters of a text that is shown in them
 RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
 
@@ -53,7 +53,8 @@ def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) 
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
-    """Return rows without long texts: the best and worst where a table ranks, else the first."""
+    """Return rows, of what differs among them and is no long text: the best and worst where a table ranks, else the
+    first."""
     import pandas as pd
 
     content = cast(Any, output.content)
@@ -67,8 +68,23 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
         samples = {
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
-    names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
+    shown = [row for rows in samples.values() for row in rows]
+    telling = [c.name for c in table.columns if _tells(c.type, [row.get(c.name) for row in shown])]
+    names = [*table.key, *([ranked] if ranked else []), *telling]
+    names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {
-        title: [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows] for title, rows in samples.items()
+        title: [dg.TableRecord({name: _plain(row.get(name)) for name in names}) for row in rows]
+        for title, rows in samples.items()
     }
     return {title: dg.MetadataValue.table(records) for title, records in tables.items() if records}
+
+
+def _tells(kind: Any, values: Sequence[Any]) -> bool:
+    """Return whether the values of a column are numbers or short texts, and not all alike."""
+    longest = max((len(value) for value in values if isinstance(value, str)), default=0)
+    is_shown = kind in (int, float, bool) or 0 < longest <= SHORT
+    return is_shown and (len(values) == 1 or len({str(value) for value in values}) > 1)
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -87,8 +87,8 @@ def stage(
 ) -> Callable[[Callable[[Workspace, Any], Any]], Stage]:
     """Declare what a function makes: a table, or files for people where only a name is given (see `graph.Stage`).
 
-    The description is the function's docstring; the code is `code_of` the group, unless stated. It returns a
-    StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown as well.
+    The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
+    It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.
     side_by_side: it gets the keys of several partitions, and yields each with its StageOutput.
     """
 
@@ -105,7 +105,7 @@ def stage(
             make=function if side_by_side else make,
             group=group,
             parents={parent.name: parent for parent in above},
-            doc=_doc(function),
+            doc=_result(_doc(function)),
             scheme=scheme,
             checks=checks,
             kinds=[*kinds],
@@ -133,6 +133,12 @@ def _with_preview(table: Table, rows: Any) -> StageOutput:
 
 def _doc(function: Callable[..., Any]) -> str:
     return " ".join((function.__doc__ or "").split())
+
+
+def _result(doc: str) -> str:
+    """Return what a docstring says that a function returns: in Dagster it describes what is made."""
+    text = doc.removeprefix("Return ")
+    return text[:1].upper() + text[1:]
 
 
 def _declare(one: Stage | Source) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 TOKEN_VARIABLE = "TRAPS_UI_TOKEN"
 DANGER = "launch runs, which spend this study's budget"
 STOP_S = 45.0  # for what is told to stop: a run waits 30 s for its calls in flight
+AGAIN = "Ctrl-C again stops at once"
 _MODULE = "traps_pipeline.definitions"
 _DRAIN_S, _PAUSE_S = 3, 0.1
 _PATIENCE = {"DAGSTER_GRPC_TIMEOUT_SECONDS": "600"}  # starting a run on a busy machine takes longer than Dagster's 60 s
@@ -53,6 +54,9 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
             started[_start(__name__, str(workspace), host, str(port), token=token)] = "web server"
             started[_start("dagster._daemon", "run", "-w", str(workspace))] = "daemon"
             pid, code = process_tree.wait_for(started)
+        except KeyboardInterrupt:
+            print(f"stopping: runs store their calls in flight, within {STOP_S:.0f} s; {AGAIN}", file=sys.stderr)
+            raise
         finally:
             process_tree.stop_descendants(STOP_S)
     raise TrapsError(
