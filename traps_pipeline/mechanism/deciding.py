@@ -90,9 +90,9 @@ def fitted_gate(
             f"a gate from {source} needs both sides of {folds} scenarios (`probes.folds`), and has "
             f"{len(train.table)} items; extract the hidden states of more pairs"
         )
-    probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs, settings.probes.solver)
+    probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs)
     made_of: list[Any] = [sorted(train.table["prompt"]), layer, threshold, folds, settings.seed, false_abs]
-    return Gate(layer, probe, cuts[threshold], pooling, digest([*made_of, settings.probes.solver])[:32])  # pyright: ignore[reportArgumentType]
+    return Gate(layer, probe, cuts[threshold], pooling, digest(made_of)[:32])  # pyright: ignore[reportArgumentType]
 
 
 def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:

@@ -167,7 +167,7 @@ def _decisions(
             continue  # a study of some datasets has the gates that these allow
         layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
         items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
-        decision = decide(items, source, str(target), solver=settings.probes.solver, **about)
+        decision = decide(items, source, str(target), **about)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
     return decisions
