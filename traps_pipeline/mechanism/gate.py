@@ -21,6 +21,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.probes import Scorer, auroc, fit_probe, scenario_folds
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.scoring.metrics import pecs_of
 
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
 OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"
@@ -162,19 +163,13 @@ class Outcomes:
         gated is decided: it abstains."""
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
-    def figures(self, weight: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return acc, false_abs, abs_rec and pecs, each () or, with weights (resamples, n), (resamples,). NaN where
-        nothing was decided."""
-        weight = np.ones((1, len(self.void))) if weight is None else weight
-        parts = {"acc": (~self.void, self.correct), "false_abs": (~self.void, self.abstained)}
-        parts |= {"abs_rec": (self.void, self.abstained)}
-        shares: dict[str, np.ndarray] = {}
-        for name, (side, values) in parts.items():
-            mask = side & np.isfinite(values)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                shares[name] = (weight[:, mask] @ values[mask]) / weight[:, mask].sum(axis=1)
-        shares["pecs"] = shares["acc"] * np.maximum(0, shares["abs_rec"] - shares["false_abs"])
-        return shares
+    def figures(self) -> dict[str, float]:
+        """Return acc, false_abs, abs_rec and pecs; NaN where nothing was decided."""
+        yes, decided = self.counts().sum(axis=0).reshape(3, 2).T
+        with np.errstate(invalid="ignore"):
+            acc, false_abs, abs_rec = yes / decided
+        shares = {"acc": acc, "false_abs": false_abs, "abs_rec": abs_rec, "pecs": pecs_of(acc, abs_rec - false_abs)}
+        return {name: float(value) for name, value in shares.items()}
 
     def counts(self) -> np.ndarray:
         """Return how often each item is yes and is decided for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""
