@@ -51,7 +51,6 @@ _IDS = "ids.parquet"
 _WRITING = "shards"  # the lease of whoever writes into a folder
 _RECORD = b"traps"
 _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
-_NOT_RECORDED = "not recorded"  # the device in shards of earlier versions
 
 
 @dataclass(frozen=True)
@@ -300,7 +299,7 @@ def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFr
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
         if rows == len(table):
-            yield path.stem, table if "device" in table else table.assign(device=_NOT_RECORDED)
+            yield path.stem, table
 
 
 def _write_ids(
@@ -346,7 +345,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
     try:
         with safe_open(file, framework="pt") as shard:
             tensor, seals = shard.get_tensor(name), shard.metadata()
-        if seals and seals.get(name) != _seal_of(tensor):  # shards of version 0.1.0 have none
+        if (seals or {}).get(name) != _seal_of(tensor):
             raise OSError("it was altered")
         return tensor.float().numpy()
     except (OSError, SafetensorError) as error:

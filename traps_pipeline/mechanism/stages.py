@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from traps_pipeline.mechanism.hidden_states import Item
     from traps_pipeline.models.local.adapter import LocalModel
 
-COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
-
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
     """Return the entry of a model in the study's `mechanism` section, with the media that it is shown there. Raises
