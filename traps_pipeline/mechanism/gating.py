@@ -132,7 +132,8 @@ def _kinds(
 ) -> Iterator[Gates]:
     """Yield states with every source; the controls with the sources that no single dataset's accidents decide."""
     names = [*dict.fromkeys(states.items["dataset"])]
-    yield Gates(STATES, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, sources)
+    by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
+    yield Gates(STATES, by_layer, sources)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
@@ -142,7 +143,7 @@ def _kinds(
         yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
     except NoMargin as error:
         progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, controls)
+    yield Gates(SHUFFLED, by_layer, controls)
     if workspace.mechanism.gate.untrained:
         from traps_pipeline.mechanism.untrained import untrained_states
 
