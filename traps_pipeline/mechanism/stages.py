@@ -83,7 +83,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     ]
     existing = workspace.store.below(folder)
     workspace.store.bring(existing)
-    done = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
+    n_new = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     workspace.store.keep(files)
     workspace.store.remove({*existing} - {*files})
@@ -106,7 +106,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
         )
         for item in items
     ]
-    return rows, done.n_new
+    return rows, n_new
 
 
 def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:
