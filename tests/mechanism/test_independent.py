@@ -199,10 +199,9 @@ def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: 
         for number, steering in rows
     ]  # fmt: skip
     backend = SteeredBackend(of.entry, vectors, MadeAnswers(FolderStore(tmp_path), tmp_path, len(requests)))
-    before = of.of.clips.used
+    before = of.of.clips.passes
     found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
-    if of.of.clips.passes:  # of classes whose features come clip by clip
-        assert of.of.clips.used > before
+    assert of.of.clips.passes - before <= 2  # clips, of classes whose features come clip by clip
     expected = []
     for number, steering in rows:
         added = None if steering is None else np.float32(steering["alpha"]) * vectors[steering["direction"]]
