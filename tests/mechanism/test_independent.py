@@ -25,7 +25,7 @@ from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
 from traps_pipeline.mechanism.made_answers import MadeAnswers
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
-from traps_pipeline.mechanism.probes import Solver, auroc, fit_probe
+from traps_pipeline.mechanism.probes import auroc, fit_probe
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
@@ -139,11 +139,9 @@ def test_probes_score_as_scikit_learns_pipeline_does(name: str) -> None:
         fitted = LogisticRegression(C=1.0, solver="newton-cg", tol=1e-10, max_iter=100_000)
         fitted.fit(scale.transform(own[seen, layer].astype(float)), dark[seen])
         expected = fitted.decision_function(scale.transform(own[:, layer].astype(float)))
-        solvers: dict[Solver, float] = {"exact": 1e-6, "sklearn": 1e-9}
-        for solver, close in solvers.items():
-            scores = fit_probe(found[seen, layer], dark[seen], solver).scores(found[:, layer].astype(float))
-            assert scores == pytest.approx(expected, abs=close)
-            assert float(auroc(dark[~seen], scores[~seen])) == roc_auc_score(dark[~seen], expected[~seen])
+        scores = fit_probe(found[seen, layer], dark[seen]).scores(found[:, layer].astype(float))
+        assert scores == pytest.approx(expected, abs=1e-6)
+        assert float(auroc(dark[~seen], scores[~seen])) == roc_auc_score(dark[~seen], expected[~seen])
 
 
 # --- steering ---------------------------------------------------------------------------------------------------------
@@ -201,10 +199,9 @@ def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: 
         for number, steering in rows
     ]  # fmt: skip
     backend = SteeredBackend(of.entry, vectors, MadeAnswers(FolderStore(tmp_path), tmp_path, len(requests)))
-    before = of.of.clips.used
+    before = of.of.clips.passes
     found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
-    if of.of.clips.passes:  # of classes whose features come clip by clip
-        assert of.of.clips.used > before
+    assert of.of.clips.passes - before <= 2  # clips, of classes whose features come clip by clip
     expected = []
     for number, steering in rows:
         added = None if steering is None else np.float32(steering["alpha"]) * vectors[steering["direction"]]

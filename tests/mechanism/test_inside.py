@@ -26,7 +26,6 @@ from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
-from traps_pipeline.mechanism.other_probes import Eraser
 from traps_pipeline.mechanism.probes import scenario_folds
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
@@ -154,13 +153,6 @@ def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, ent
                 assert gate.answer(model, prompt, 4) == expected
                 decided.add(theirs)
     assert decided == {True, False}
-
-
-def test_an_erased_state_is_changed_alike_whatever_stands_beside_it(study: Workspace) -> None:
-    states = inside.load(study, "tiny", layer=2, datasets=["chaotic"])
-    eraser = Eraser.of(states.X, states.void)
-    assert eraser(states.X) == pytest.approx(inside.erased(states.X, states.void))
-    assert eraser(states.X[:3]) == pytest.approx(eraser(states.X)[:3])
 
 
 def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_else() -> None:

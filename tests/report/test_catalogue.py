@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import pandas as pd
@@ -270,7 +270,7 @@ def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, emp
 
 def test_the_doubt_figure_refuses_to_mix_epochs():
     class Mixed(PublishedResults):
-        makers = PublishedResults.makers | {"confabulation": lambda _: PAPER.confabulation.assign(epoch="corrected")}
+        confabulation = cached_property(lambda _: PAPER.confabulation.assign(epoch="corrected"))
 
     points, refused = doubt_points(Mixed())
     assert not len(points)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar, cast
+from typing import cast
 
 import pandas as pd
 import pytest
@@ -27,7 +28,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.cards import Sources
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
-from traps_pipeline.report.result_frames import Makers, Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
 from traps_pipeline.report.tables.inside_columns import why
@@ -145,18 +146,16 @@ class Made(Results):
     """Results with rows of every control."""
 
     source, is_study = "made up", True
-    makers: ClassVar[Makers] = {
-        "prompted_probes": lambda _: probes(),
-        "prompted_baselines": lambda _: baselines(),
-        "gate": lambda _: gate(),
-        "risk_coverage": lambda _: curves(),
-        "patching": lambda _: patching(),
-        "item_scores": lambda _: item_scores(),
-        "lens": lambda _: lens(),
-        "sentences": lambda _: sentences(),
-        "nulls": lambda _: nulls(),
-        "own_effects": lambda _: own_effects(effects()),
-    }
+    prompted_probes = cached_property(lambda _: probes())
+    prompted_baselines = cached_property(lambda _: baselines())
+    gate = cached_property(lambda _: gate())
+    risk_coverage = cached_property(lambda _: curves())
+    patching = cached_property(lambda _: patching())
+    item_scores = cached_property(lambda _: item_scores())
+    lens = cached_property(lambda _: lens())
+    sentences = cached_property(lambda _: sentences())
+    nulls = cached_property(lambda _: nulls())
+    own_effects = cached_property(lambda _: own_effects(effects()))
 
 
 def cells(table: PrintedTable) -> list[dict[str, str]]:
@@ -195,8 +194,8 @@ def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
     assert (row["Best raw input"], row["its AUROC"], row["Noise"]) == ("time stamps", "1.000", "0.500 ± 0.100")
     assert (row["Voids answered about"], row["Voids"], row["Controls"]) == ("64", "16", "16")
     made = Made()
-    made.made["prompted_probes"] = probes().assign(n_voids=9)
-    made.made["gate"] = gate().assign(n_voids=9)
+    made.prompted_probes = probes().assign(n_voids=9)
+    made.gate = gate().assign(n_voids=9)
     (few,) = cells(control_reports.gate(made)[-1])
     assert (few["guided"], few["Probe, standard"], few["Output margin, standard"]) == ("50.0 †", "0.980 †", "0.900 †")
     assert row["Probe, guided"] == "0.960" and row["Output margin, guided"] == row["AbsRec %, standard"] == "–"
@@ -216,7 +215,7 @@ def test_few_answers_are_marked_and_p_is_printed() -> None:
 def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:
     made, rows = Made(), patching()
     sites = [rows.assign(site=site, effect=rows["effect"] / n) for n, site in enumerate(("mlp", "attention"), start=2)]
-    made.made["patching"] = pd.concat([*(part.loc[part["source"] == "pair"] for part in sites), rows])
+    made.patching = pd.concat([*(part.loc[part["source"] == "pair"] for part in sites), rows])
     (table,) = patching_table(made)
     found = [(row["Site"], row["Indirect effect"], row["Same side"]) for row in cells(table)]
     assert found == [("residual stream", "0.990 †", "0.010"), ("attention", "0.330 †", "–"), ("MLP", "0.495 †", "–")]
@@ -282,7 +281,7 @@ def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_i
 def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no_answer() -> None:
     every = effects().assign(n_missing=0, degenerate=1)
     made = Made()
-    made.made["effects"] = study_results._effects(cast(StudyResults, SimpleNamespace(rows=lambda _: every)))
+    made.effects = study_results._effects(cast(StudyResults, SimpleNamespace(rows=lambda _: every)))
     found = {table.name: table for table in steering_tables(made)}
     (row,) = cells(found["steering_top"])
     assert (row["α"], row["in class gaps"]) == ("10", "0.05")  # the gap is 200

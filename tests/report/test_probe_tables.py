@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import product
-from typing import ClassVar
 
 import pandas as pd
 import pytest
@@ -12,7 +12,7 @@ from traps_pipeline.mechanism.control_rows import PROBE_BASELINES
 from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.protocol.datasets import ANSWERABLE
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.result_frames import Makers, Results
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.probe_tables import probes
 from traps_pipeline.report.writing import PrintedTable
 from traps_pipeline.storage.tables import Table
@@ -68,7 +68,8 @@ class Made(Results):
     """Results of one model's probes."""
 
     source, is_study = "made up", True
-    makers: ClassVar[Makers] = {"prompted_probes": lambda _: states(), "prompted_baselines": lambda _: baselines()}
+    prompted_probes = cached_property(lambda _: states())
+    prompted_baselines = cached_property(lambda _: baselines())
 
 
 def tables(results: Results | None = None) -> dict[str, PrintedTable]:
@@ -136,5 +137,5 @@ def test_the_papers_tables_have_no_empty_columns_of_baselines() -> None:
 def test_a_raw_input_is_named_only_where_it_is_above_chance() -> None:
     made = Made()
     rows = baselines()
-    made.made["prompted_baselines"] = rows.assign(value=rows["value"].where(rows["features"] == "noise", 0.5))
+    made.prompted_baselines = rows.assign(value=rows["value"].where(rows["features"] == "noise", 0.5))
     assert first(tables(made)["probe_transfer"])["Best raw input"] == "none above .5"

@@ -107,7 +107,7 @@ def test_the_report_has_an_interval_and_a_rule_beside_each_number(rows: Rows):
         is_study = True
 
     study = Study()
-    study.made["hypotheses"] = made
+    study.hypotheses = made
     answers = next(one for one in printed(study) if one.name == "hypothesis_answer_space")
     cells = dict(zip([column.heading for column in answers.columns], answers.cells[1], strict=True))
     assert cells["AbsRec %"].startswith("100.0 [") and cells["AbsRec %"].endswith(", 100.0]")

@@ -20,7 +20,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.control_rows import ProbeBaselineRow
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.probes import Fit
+from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
@@ -78,7 +78,7 @@ class AsItIs:
         return states[:, 0]
 
 
-def scored(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Row]:
+def scored(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
     """Return the rows of the protocol on features in the place of states, those of nearest centroids included. fit:
     another probe than the protocol's."""
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)

@@ -75,9 +75,7 @@ class ProbeBaselineRow(Extracted):
     """A figure of the probing protocol on other features than states."""
 
     features: Annotated[
-        str,
-        "question words, first frame, all frames, length, time stamps, output margin, noise as wide as states, or "
-        "states with the name of another probe than that of `probes`, at the layer that is steered",
+        str, "question words, first frame, all frames, length, time stamps, output margin or noise as wide as states"
     ]
     analysis: Annotated[str, "as in probes, but for within and shuffled"]
     source: Annotated[str, "dataset that was fitted"]

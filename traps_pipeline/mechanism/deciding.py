@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
@@ -28,13 +27,12 @@ Threshold = Literal["mid", "J", "conformal"]
 @dataclass(frozen=True, eq=False)
 class Gate:
     """A gate: a probe of the states at a layer, whose score above the threshold means abstaining. pooling: of the
-    states that it was fitted on. made_of: digest of these states and of what else decided it."""
+    states that it was fitted on."""
 
     layer: int
     probe: Scorer
     threshold: float
     pooling: Pooling
-    made_of: str
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
         """Return the probe's log-odds of void for a prompt: one pass of the plain model."""
@@ -90,9 +88,8 @@ def fitted_gate(
             f"a gate from {source} needs both sides of {folds} scenarios (`probes.folds`), and has "
             f"{len(train.table)} items; extract the hidden states of more pairs"
         )
-    probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs, settings.probes.solver)
-    made_of: list[Any] = [sorted(train.table["prompt"]), layer, threshold, folds, settings.seed, false_abs]
-    return Gate(layer, probe, cuts[threshold], pooling, digest([*made_of, settings.probes.solver])[:32])  # pyright: ignore[reportArgumentType]
+    probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs)
+    return Gate(layer, probe, cuts[threshold], pooling)  # pyright: ignore[reportArgumentType]
 
 
 def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:

@@ -6,11 +6,11 @@ target, kind, layer, alpha, side, abstention (a fraction).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from traps_pipeline.mechanism.directions import KINDS
-from traps_pipeline.mechanism.transfer_paths import FAMILIES, PATH_SETS
+from traps_pipeline.mechanism.transfer_paths import PATH_SETS
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.protocol.regimes import GUIDED
 
@@ -56,42 +56,30 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
     """Return REGIME_COLUMNS: mean abstention over the paths of each set at alpha 0 and at the largest alpha, by
     direction regime, inference regime and kind of direction; family `all`."""
-    return _regime_rows(effects, lambda rows: iter([("all", rows)]))
+    return _regime_rows(effects, lambda source: "all")
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
     """Return the columns of `regime_matrix` for guided directions under guided inference, by taxonomy of the
     direction's source (`family`)."""
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
-
-    def families(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-        for family in FAMILIES:
-            yield family, rows.loc[rows["source"].map(taxonomy_of) == family]
-
-    return _regime_rows(guided, families)
+    return _regime_rows(guided, taxonomy_of)
 
 
-def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
+def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.DataFrame:
     import pandas as pd
 
-    rows = paths(effects)
+    rows, keys = paths(effects), [*CELL, "kind", "family"]
+    rows = rows.assign(family=[family(source) for source in rows["source"]])
     result: list[Mapping[str, Any]] = []
     for path_set, members in PATH_SETS.items():
         inside = [pair in members for pair in zip(rows["source"], rows["target"], strict=True)]
-        for (model, directions, regime, kind), cell in rows.loc[inside].groupby([*CELL, "kind"], sort=False):  # pyright: ignore[reportGeneralTypeIssues]
-            for family, part in split(cell):
-                if not len(part):
-                    continue
-                top = part["alpha"].max()
-                ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
-                sides = ("control", "void")
-                figures = {f"{side}_{end}": at[side].mean() for side in sides for end, at in ends.items()}
-                result.append(
-                    {
-                        **{"model": model, "path_set": path_set, "family": family, "directions": directions},
-                        **{"regime": regime, "kind": kind, "n_paths": len(ends["top"]), "alpha": top, **figures},
-                    }
-                )
+        for key, part in rows.loc[inside].groupby(keys, sort=False):
+            about = dict(zip(keys, cast("tuple[str, ...]", key), strict=True))
+            top = part["alpha"].max()
+            ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
+            figures = {f"{side}_{end}": at[side].mean() for side in ("control", "void") for end, at in ends.items()}
+            result.append({**about, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **figures})
     return pd.DataFrame(result, columns=pd.Index(REGIME_COLUMNS))
 
 

@@ -18,9 +18,10 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.probes import Scorer, Solver, auroc, fit_probe, scenario_folds
+from traps_pipeline.mechanism.probes import Scorer, auroc, fit_probe, scenario_folds
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.scoring.metrics import pecs_of
 
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
 OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"
@@ -82,9 +83,7 @@ def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS
     return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
 
 
-def decide(
-    items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
-) -> Decisions:
+def decide(items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float) -> Decisions:
     """Return the decisions of the gates of a source about every item of a target dataset.
 
     A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
@@ -106,7 +105,7 @@ def decide(
         train = items.rows(inside & ~np.isin(groups, fold))
         if len(set(train.void)) < 2:
             continue
-        probe, cuts, shares = fit_gate(train, folds, seed, false_abs, solver)
+        probe, cuts, shares = fit_gate(train, folds, seed, false_abs)
         score[here] = probe.scores(items.features[scored[here]])
         for name in THRESHOLDS:
             cut[name][here], expected[name][here] = cuts[name], shares[name]
@@ -114,12 +113,12 @@ def decide(
 
 
 def fit_gate(
-    train: Items, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
+    train: Items, folds: int, seed: int, false_abs: float
 ) -> tuple[Scorer, dict[str, float], dict[str, float]]:
     """Return a gate from its source's items: the probe, its thresholds by name, and the share of the calibrating
     controls above each. There must be both sides, in two scenarios or more."""
-    probe = fit_probe(train.features, train.void, solver)
-    calibrating, void = _own_scores(train, folds, seed, solver)
+    probe = fit_probe(train.features, train.void)
+    calibrating, void = _own_scores(train, folds, seed)
     cuts = thresholds(calibrating, void, false_abs)
     return probe, cuts, {name: float((calibrating[~void] > cut).mean()) for name, cut in cuts.items()}
 
@@ -134,7 +133,7 @@ def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iter
     yield from (names[fold == k] for k in range(folds))
 
 
-def _own_scores(train: Items, folds: int, seed: int, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
+def _own_scores(train: Items, folds: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return scores and labels of the source's distinct prompts, each by a probe that was not fitted on its
     scenario.
     """
@@ -143,7 +142,7 @@ def _own_scores(train: Items, folds: int, seed: int, solver: Solver) -> tuple[np
     for k in range(folds):
         rest = train.rows(fold != k)
         if len(set(rest.void)) == 2:
-            score[fold == k] = fit_probe(rest.features, rest.void, solver).scores(train.features[fold == k])
+            score[fold == k] = fit_probe(rest.features, rest.void).scores(train.features[fold == k])
     first = ~train.table.duplicated(["prompt"]).to_numpy() & np.isfinite(score)
     return score[first], train.void[first]
 
@@ -164,19 +163,13 @@ class Outcomes:
         gated is decided: it abstains."""
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
-    def figures(self, weight: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return acc, false_abs, abs_rec and pecs, each () or, with weights (resamples, n), (resamples,). NaN where
-        nothing was decided."""
-        weight = np.ones((1, len(self.void))) if weight is None else weight
-        parts = {"acc": (~self.void, self.correct), "false_abs": (~self.void, self.abstained)}
-        parts |= {"abs_rec": (self.void, self.abstained)}
-        shares: dict[str, np.ndarray] = {}
-        for name, (side, values) in parts.items():
-            mask = side & np.isfinite(values)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                shares[name] = (weight[:, mask] @ values[mask]) / weight[:, mask].sum(axis=1)
-        shares["pecs"] = shares["acc"] * np.maximum(0, shares["abs_rec"] - shares["false_abs"])
-        return shares
+    def figures(self) -> dict[str, float]:
+        """Return acc, false_abs, abs_rec and pecs; NaN where nothing was decided."""
+        yes, decided = self.counts().sum(axis=0).reshape(3, 2).T
+        with np.errstate(invalid="ignore"):
+            acc, false_abs, abs_rec = yes / decided
+        shares = {"acc": acc, "false_abs": false_abs, "abs_rec": abs_rec, "pecs": pecs_of(acc, abs_rec - false_abs)}
+        return {name: float(value) for name, value in shares.items()}
 
     def counts(self) -> np.ndarray:
         """Return how often each item is yes and is decided for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""

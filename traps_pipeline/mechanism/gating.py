@@ -44,9 +44,9 @@ from traps_pipeline.scoring.bootstrap import (
     draw_scenarios,
     figures_of,
     interval,
-    resampled_sums,
-    with_unseen,
+    run_sums,
 )
+from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
 STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
@@ -132,7 +132,8 @@ def _kinds(
 ) -> Iterator[Gates]:
     """Yield states with every source; the controls with the sources that no single dataset's accidents decide."""
     names = [*dict.fromkeys(states.items["dataset"])]
-    yield Gates(STATES, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, sources)
+    by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
+    yield Gates(STATES, by_layer, sources)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
@@ -142,7 +143,7 @@ def _kinds(
         yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
     except NoMargin as error:
         progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}, controls)
+    yield Gates(SHUFFLED, by_layer, controls)
     if workspace.mechanism.gate.untrained:
         from traps_pipeline.mechanism.untrained import untrained_states
 
@@ -167,7 +168,7 @@ def _decisions(
             continue  # a study of some datasets has the gates that these allow
         layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
         items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
-        decision = decide(items, source, str(target), solver=settings.probes.solver, **about)
+        decision = decide(items, source, str(target), **about)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
     return decisions
@@ -222,12 +223,11 @@ def _rows(
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
             gated = outcome.gated(gate)
-            plain_figures, figures = outcome.figures(), gated.figures()
+            values = gated.figures()
             if target not in DATASETS:  # what the gate alone would do to items that must be answered
-                figures = {"acc": np.array([np.nan]), "pecs": np.array([np.nan]), "abs_rec": np.array([np.nan])}
-                figures["false_abs"] = np.array([gate[~outcome.void].mean() if (~outcome.void).any() else np.nan])
-            values = {name: value.item() for name, value in figures.items()}
-            values |= {f"plain_{name}": value.item() for name, value in plain_figures.items()}
+                values = dict.fromkeys(values, np.nan)
+                values["false_abs"] = float(gate[~outcome.void].mean()) if (~outcome.void).any() else np.nan
+            values |= {f"plain_{name}": value for name, value in outcome.figures().items()}
             values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
@@ -254,14 +254,9 @@ def _rows(
 def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
     """Return resampled sums of a dataset's outcomes with an unseen scenario, (9, 1 + resamples). The datasets of a
     taxonomy share their resamples, and taxonomies do not. scenarios: (n,), of each item."""
-    taxonomy = probed_taxonomy(target)
-    resampling = draw_scenarios(pd.DataFrame({"scenario_id": scenarios, "taxonomy": taxonomy}), resamples, seed)
-    ids, weights = resampling.scenarios[taxonomy]
-    counts = np.zeros((len(ids), 6))
-    np.add.at(counts, ids.get_indexer(pd.Index(scenarios)), outcomes.counts())
-    having = (counts[:, 1::2] > 0).sum(axis=0)
-    sums = resampled_sums(weights, counts[:, None])[0]
-    return with_unseen(sums, having, resampling.unseen(f"gate|{target}", decisions=3))
+    about = {"dataset": target, "run": 1, "scenario_id": scenarios, "taxonomy": probed_taxonomy(target)}
+    items = pd.DataFrame(outcomes.counts(), columns=pd.Index(COUNTS)).assign(**about)
+    return run_sums(items, draw_scenarios(items, resamples, seed), "gate")[target, 1]
 
 
 def _row(

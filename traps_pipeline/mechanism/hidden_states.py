@@ -1,6 +1,6 @@
 """Extraction: the hidden states of many items, in shards that a crash does not damage (docs/spec.md 7.1).
 
-    done = extract(model, items, folder, pooling="last")
+    n_new = extract(model, items, folder, pooling="last")
     ids, states = read_layer(folder, 20)                # item_id, side, key, device; (n, d) float32 in the same order
 
 A folder holds `shard-NNNNN.safetensors` (one key per layer, `layer_000` = embeddings, and `normed`), a `.parquet` file
@@ -51,7 +51,6 @@ _IDS = "ids.parquet"
 _WRITING = "shards"  # the lease of whoever writes into a folder
 _RECORD = b"traps"
 _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
-_NOT_RECORDED = "not recorded"  # the device in shards of earlier versions
 
 
 @dataclass(frozen=True)
@@ -65,16 +64,6 @@ class Item:
     about: Mapping[str, Any]
     prompt: Callable[[], Prompt]
     other: Callable[[], Prompt] | None = None
-
-
-@dataclass(frozen=True)
-class Extracted:
-    """The result of an extraction. version: digest of the folder's current content, equal for equal items and model."""
-
-    folder: Path
-    n_items: int
-    n_new: int
-    version: str
 
 
 _Made = tuple[Item, str, "States"]  # an item, its key, its states
@@ -127,8 +116,9 @@ def extract(
     pooling: Pooling = "last",
     shard_size: int = SHARD_SIZE,
     what: str = "items",
-) -> Extracted:
-    """Make the missing states of the items, one prompt per pass, then write the current row of each item.
+) -> int:
+    """Make the missing states of the items, one prompt per pass, then write the current row of each item; returns how
+    many were made.
 
     Several processes may work at one folder: each takes chunks of `shard_size` items that no other one has. If one ends
     early (Ctrl-C, an error, a kill), the states made so far are written, but for the chunk that a kill interrupts, and
@@ -151,8 +141,7 @@ def extract(
         _write_ids(folder, items, keys, known, _record(model, pooling))
         _sweep(folder, {known[key][0] for key in keys})
     _note_devices(folder, sorted({known[key][2] for key in keys}))
-    version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
-    return Extracted(folder, len(items), count, version)
+    return count
 
 
 def _tick(what: str, before: int, total: int, done: int) -> None:
@@ -300,7 +289,7 @@ def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFr
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
         if rows == len(table):
-            yield path.stem, table if "device" in table else table.assign(device=_NOT_RECORDED)
+            yield path.stem, table
 
 
 def _write_ids(
@@ -346,7 +335,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
     try:
         with safe_open(file, framework="pt") as shard:
             tensor, seals = shard.get_tensor(name), shard.metadata()
-        if seals and seals.get(name) != _seal_of(tensor):  # shards of version 0.1.0 have none
+        if (seals or {}).get(name) != _seal_of(tensor):
             raise OSError("it was altered")
         return tensor.float().numpy()
     except (OSError, SafetensorError) as error:

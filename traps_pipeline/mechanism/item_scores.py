@@ -41,7 +41,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
         items = gate_items(table, features, shuffled=False, seed=settings.seed)
         for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
             if sources_of_gate(source, dataset, present):
-                decision = decide(items, source, dataset, solver=settings.probes.solver, **about)
+                decision = decide(items, source, dataset, **about)
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {

@@ -26,12 +26,11 @@ LOOKS_LIKE = {**LOOK_ALIKES, TIME_SWAPPED: "chaotic"}  # without labels of their
 
 @dataclass(frozen=True)
 class LayerChoice:
-    """The layer of a target, without its labels. curve: by layer, the mean AUROC of `n_pairs` pairs of other datasets.
+    """The layer of a target, without its labels. curve: by layer, the mean AUROC of pairs of other datasets.
     tied: the layers that reach its maximum; the middle one is taken, since the ends of a plateau are next to what is
     worse."""
 
     curve: Mapping[int, float]
-    n_pairs: int
 
     @property
     def tied(self) -> list[int]:
@@ -70,4 +69,4 @@ def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
     if not pairs:
         raise TrapsError("probes: no dataset has both sides, so no layer can be chosen; extract more hidden states")
     layers = sorted(set.intersection(*({*curves[pair]} for pair in pairs)))
-    return LayerChoice({n: float(np.mean([curves[pair][n] for pair in pairs])) for n in layers}, len(pairs))
+    return LayerChoice({n: float(np.mean([curves[pair][n] for pair in pairs])) for n in layers})

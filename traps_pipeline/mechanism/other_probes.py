@@ -43,35 +43,16 @@ class _Estimator:
         return np.log(chance / (1 - chance))
 
 
-@dataclass(frozen=True, eq=False)
-class Eraser:
-    """Least-squares concept erasure for one binary concept (LEACE, of Belrose et al. 2023): the smallest change of
-    states, in the metric of their own covariance, after which both sides have the same mean.
-
-    mean: (d,), of the states that it was fitted on. read, written: (d,), what of a state is taken out, and along what.
-    """
-
-    mean: np.ndarray
-    read: np.ndarray
-    written: np.ndarray
-
-    @staticmethod
-    def of(states: np.ndarray, void: np.ndarray) -> Eraser:
-        """Return the erasure of which side an item is on, from states (n, d) and void (n,)."""
-        states = np.asarray(states, float)
-        mean, label = states.mean(axis=0), void - np.mean(void)
-        left, size, right = np.linalg.svd(states - mean, full_matrices=False)
-        mask = size > size[0] * max(states.shape) * np.finfo(float).eps
-        towards = left[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
-        towards /= np.linalg.norm(towards)
-        return Eraser(mean, (towards / size[mask]) @ right[mask], (towards * size[mask]) @ right[mask])
-
-    def __call__(self, states: np.ndarray) -> np.ndarray:
-        """Return states (m, d) without the concept."""
-        states = np.asarray(states, float)
-        return states - np.outer((states - self.mean) @ self.read, self.written)
-
-
 def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """Return states (n, d) from which no linear classifier can tell the sides, by the `Eraser` of these very states."""
-    return Eraser.of(states, void)(states)
+    """Return states (n, d) from which no linear classifier can tell the sides, void (n,).
+
+    Least-squares concept erasure (LEACE, of Belrose et al. 2023) of these very states: the smallest change, in the
+    metric of their own covariance, after which both sides have the same mean.
+    """
+    states = np.asarray(states, float)
+    centred, label = states - states.mean(axis=0), void - np.mean(void)
+    left, size, right = np.linalg.svd(centred, full_matrices=False)
+    mask = size > size[0] * max(states.shape) * np.finfo(float).eps
+    towards = left[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
+    towards /= np.linalg.norm(towards)
+    return states - np.outer(centred @ ((towards / size[mask]) @ right[mask]), (towards * size[mask]) @ right[mask])

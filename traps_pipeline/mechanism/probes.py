@@ -1,25 +1,20 @@
 """Linear probes: standardise, l2-regularised logistic regression, AUROC (docs/spec.md 7.2).
 
 With fewer rows than columns the minimiser lies in the span of the rows, so the exact solver takes Newton steps on the
-Gram matrix. Its optimum equals scikit-learn's up to rounding and takes a fraction of the time. scikit-learn itself can
-be selected as the reference.
+Gram matrix. Its optimum equals scikit-learn's up to rounding and takes a fraction of the time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
 
-Solver = Literal["exact", "sklearn"]
-PENALTY = 1.0  # scikit-learn's C: the weight of the loss against half the squared norm of the coefficients
 _TOLERANCE, _MOST_STEPS = 1e-10, 200
-# scikit-learn's default solver (lbfgs, 1e-4) stops early; even at 1e-8 it is 1e-5 from the minimum in log-odds.
-REFERENCE: dict[str, Any] = {"solver": "newton-cg", "tol": 1e-10, "max_iter": 100_000}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +67,14 @@ def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.where(constant, 1.0, np.sqrt(variance))
 
 
-def fit_probe(states: np.ndarray, void: np.ndarray, solver: Solver = "exact", penalty: float = PENALTY) -> Probe:
+def fit_probe(states: np.ndarray, void: np.ndarray) -> Probe:
     """Return the probe of states (n, d) with labels (n,). Raises TrapsError when one class has no item."""
     _check_labels(void)
     states = np.asarray(states, float)
     mean, scale = standardiser(states)
     standard = (states - mean) / scale
-    if solver == "sklearn":
-        weights, intercept = _reference(standard, void, penalty)
-    else:
-        dual, intercept = solve_gram(standard @ standard.T, void, penalty)
-        weights = standard.T @ dual
-    return Probe(mean, scale, weights, intercept)
+    dual, intercept = solve_gram(standard @ standard.T, void)
+    return Probe(mean, scale, standard.T @ dual, intercept)
 
 
 def _check_labels(void: np.ndarray) -> None:
@@ -94,19 +85,12 @@ def _check_labels(void: np.ndarray) -> None:
         )
 
 
-def _reference(standard: np.ndarray, void: np.ndarray, penalty: float) -> tuple[np.ndarray, float]:
-    from sklearn.linear_model import LogisticRegression
-
-    model = LogisticRegression(C=penalty, **REFERENCE).fit(standard, void)
-    return model.coef_[0], float(model.intercept_[0])
-
-
-def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> tuple[np.ndarray, float]:
+def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the logistic regression with an unpenalised intercept, by its Gram matrix (n, n): dual coefficients (n,)
     and intercept. The coefficients of the columns are the rows' transpose times the dual.
 
-    At the minimum the dual is penalty * (label - probability) and sums to 0. Newton's step solves
-    (I + W gram) step + W intercept_step = residual of that condition, with W = penalty * p (1 - p), through
+    At the minimum the dual is label - probability and sums to 0. Newton's step solves
+    (I + W gram) step + W intercept_step = residual of that condition, with W = p (1 - p), through
     I + sqrt(W) gram sqrt(W), whose eigenvalues are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved
     until the objective falls. A factorisation is used again while each step with it reduces the residual to a fifth or
     less, since W hardly changes near the minimum. Raises TrapsError for states that are not finite.
@@ -118,20 +102,20 @@ def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> 
     label = np.asarray(void, float)
     dual, intercept = np.zeros(len(label)), float(np.log(label.mean() / (1 - label.mean())))
     logits = np.full(len(label), intercept)
-    value, newton, before = _objective(dual, intercept, logits, label, penalty), None, np.inf
+    value, newton, before = _objective(dual, intercept, logits, label), None, np.inf
     for _ in range(_MOST_STEPS):
         chance = expit(logits)
-        missing = penalty * (label - chance) - dual
+        missing = label - chance - dual
         worst = max(np.abs(missing).max(), abs(dual.sum()) / len(label))
-        if worst < _TOLERANCE * penalty:
+        if worst < _TOLERANCE:
             return dual, intercept
         if newton is None or worst > 0.2 * before:
-            newton = _NewtonStep(gram, penalty * chance * (1 - chance))
+            newton = _NewtonStep(gram, chance * (1 - chance))
         step, intercept_step = newton.solve(missing, dual.sum())
         logit_step, size, before = gram @ step + intercept_step, 1.0, worst
         while True:
             moved = dual + size * step, intercept + size * intercept_step, logits + size * logit_step
-            new_value = _objective(*moved, label, penalty)
+            new_value = _objective(*moved, label)
             if new_value <= value + 1e-12 * abs(value) or size < 1e-6:
                 break
             size /= 2
@@ -171,9 +155,9 @@ class _NewtonStep:
         return free - intercept_step * self._by_intercept, intercept_step
 
 
-def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np.ndarray, penalty: float) -> float:
+def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np.ndarray) -> float:
     loss = np.logaddexp(0, logits).sum() - label @ logits
-    return float(0.5 * dual @ (logits - intercept) + penalty * loss)
+    return float(0.5 * dual @ (logits - intercept) + loss)  # scikit-learn's, with C = 1
 
 
 # --- scoring ----------------------------------------------------------------------------------------------------------
@@ -248,7 +232,7 @@ def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: 
     return np.asarray(void, bool)[:, None] ^ coins[place]
 
 
-def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: Solver = "exact") -> np.ndarray:
+def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndarray:
     """Return cross-validated AUROC of each labelling (n, k), averaged over folds: (k,).
 
     Standardiser and probe use only the training folds; all labellings share the Gram matrix of a fold.
@@ -259,13 +243,9 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: So
         states = np.asarray(split.states[train], float)
         mean, scale = standardiser(states)
         train_states, unseen = (states - mean) / scale, (split.states[test] - mean) / scale
-        if solver == "sklearn":
-            fitted = [_reference(train_states, column, PENALTY) for column in labels[train].T]
-            scores = np.column_stack([unseen @ weights for weights, _ in fitted])
-        else:
-            gram = train_states @ train_states.T
-            duals = np.column_stack([solve_gram(gram, column)[0] for column in labels[train].T])
-            scores = unseen @ (train_states.T @ duals)
+        gram = train_states @ train_states.T
+        duals = np.column_stack([solve_gram(gram, column)[0] for column in labels[train].T])
+        scores = unseen @ (train_states.T @ duals)
         areas.append([auroc(labels[test, k], scores[:, k]) for k in range(labels.shape[1])])
     return np.mean(areas, axis=0)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import product
 from typing import Any, TypeVar
 
@@ -87,7 +86,7 @@ class ProbeRun:
     settings: ProbeSettings
     seed: int
     confabulated: Confabulated = field(default_factory=lambda: Confabulated({}))
-    fit: Fit | None = None  # another probe than the logistic regression of the settings
+    fit: Fit = fit_probe
 
     def __post_init__(self) -> None:
         if not 0 <= self.centroid_layer < self.n_layers:
@@ -95,7 +94,6 @@ class ProbeRun:
                 f"mechanism.models: centroid layer {self.centroid_layer} is out of range; there are states of layers "
                 f"0 to {self.n_layers - 1}"
             )
-        self._fit: Fit = self.fit or partial(fit_probe, solver=self.settings.solver)
         self._datasets = [name for name in PROBED_DATASETS if name in set(self.items["dataset"])]
         self._own = [name for name in DATASETS if name in self._datasets]
         if not self._own:
@@ -159,14 +157,14 @@ class ProbeRun:
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so
         that half of the rows of a cross-modality target were used in the fit (see `held_out`)."""
-        scores = transfer_scores(splits, self._pairs, self._fit)
+        scores = transfer_scores(splits, self._pairs, self.fit)
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the same pairs with source and target restricted to confabulated void items and their own controls."""
         restricted = self._confabulated(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
-        scores = transfer_scores(restricted, pairs, self._fit)
+        scores = transfer_scores(restricted, pairs, self.fit)
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
@@ -209,7 +207,7 @@ class ProbeRun:
             split = splits[name]
             folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
             swapped = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
-            areas = within_split(split, np.column_stack([split.void, swapped]), folds, self.settings.solver)
+            areas = within_split(split, np.column_stack([split.void, swapped]), folds)
             shuffled = areas[1:]
             rows.append(_row("within", (name, name), layer, areas[0], split))
             rows.append(_row("shuffled", (name, name), layer, shuffled.mean(), split, spread=shuffled.std()))
@@ -273,12 +271,12 @@ class ProbeRun:
         others = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
         if others:
-            probe = self._fit(split.states, split.void)
+            probe = self.fit(split.states, split.void)
             scores |= {name: probe.scores(splits[name].states) for name in others}
         folds = self._folds({name: splits[name] for name in own})
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)
-            probe = self._fit(train.states, train.void)
+            probe = self.fit(train.states, train.void)
             for name in own:
                 scores[name][folds[name] == fold] = probe.scores(splits[name].states[folds[name] == fold])
         return scores

@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from traps_pipeline.mechanism.hidden_states import Item
     from traps_pipeline.models.local.adapter import LocalModel
 
-COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
-
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
     """Return the entry of a model in the study's `mechanism` section, with the media that it is shown there. Raises
@@ -85,7 +83,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     ]
     existing = workspace.store.below(folder)
     workspace.store.bring(existing)
-    done = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
+    n_new = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     workspace.store.keep(files)
     workspace.store.remove({*existing} - {*files})
@@ -108,7 +106,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
         )
         for item in items
     ]
-    return rows, done.n_new
+    return rows, n_new
 
 
 def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:

@@ -212,7 +212,7 @@ def _wrong_votes(
         if request.key != row["vote_key"]:
             yield f"answer of {_named(row)}: is not the text, or not to the question, that {seat.id} judged"
             continue
-        wrong = _other_vote(row, item, _cast_again(request) if seat.backend == RULE else None)
+        wrong = _other_vote(row, item, _cast_again(str(row["task"]), request.user) if seat.backend == RULE else None)
         if wrong:
             yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {wrong}"
     for key, row in texts.items():
@@ -223,14 +223,9 @@ def _wrong_votes(
 
 
 @cache
-def _rules_on(task: str, user: str) -> Outcome:
-    request = Request("rules", RULE, {}, "", user, {"task": task})
-    return asyncio.run(RuleJudge().ask(request))
-
-
-def _cast_again(request: Request) -> Outcome:
+def _cast_again(task: str, user: str) -> Outcome:
     """Return what the rules make of a request: they read its text and its task alone."""
-    return _rules_on(str(request.about["task"]), request.user)
+    return asyncio.run(RuleJudge().ask(Request("rules", RULE, {}, "", user, {"task": task})))
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:

@@ -25,7 +25,6 @@ def report_html(
     findings: Sequence[Finding] = (),
     address: Address | None = None,
     explorer: str = "",
-    title: str = "TRAPSBench report",
     robust: pd.DataFrame | None = None,
     notes: Sequence[str] = (),
     terms: Mapping[str, str] | None = None,
@@ -52,7 +51,7 @@ def report_html(
         environment()
         .get_template("report.html.j2")
         .render(
-            title=title,
+            title="TRAPSBench report",
             provenance=provenance(board),
             explorer=explorer,
             findings=findings,

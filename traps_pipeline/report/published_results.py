@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.protocol.datasets import LONG
-from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Makers, Results, joined
+from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.published import published, published_cells
@@ -130,16 +131,14 @@ class PublishedResults(Results):
     """
 
     source = "published"
-    makers: ClassVar[Makers] = {
-        "cells": _cells,
-        "overall": _overall,
-        "rates": _rates,
-        "sub_cells": lambda results: _none("model", "dataset", "regime", "scope", "abs_rec", "n_pairs"),
-        "sub_scenarios": _sub_scenarios,
-        "labels": lambda results: _none("dataset", "sub_scenario", "label", "acc"),
-        "confabulation": _confabulation,
-        "composition": lambda results: _none("taxonomy", "category", "void", "n", "n_ill_posed"),
-        "probes": _probes,
-        "cosines": _cosines,
-        "effects": _effects,
-    }
+    cells = cached_property(_cells)
+    overall = cached_property(_overall)
+    rates = cached_property(_rates)
+    sub_cells = cached_property(lambda results: _none("model", "dataset", "regime", "scope", "abs_rec", "n_pairs"))
+    sub_scenarios = cached_property(_sub_scenarios)
+    labels = cached_property(lambda results: _none("dataset", "sub_scenario", "label", "acc"))
+    confabulation = cached_property(_confabulation)
+    composition = cached_property(lambda results: _none("taxonomy", "category", "void", "n", "n_ill_posed"))
+    probes = cached_property(_probes)
+    cosines = cached_property(_cosines)
+    effects = cached_property(_effects)

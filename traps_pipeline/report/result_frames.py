@@ -6,9 +6,9 @@ A frame without rows means that its part was not run. Shares are fractions; ever
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
@@ -61,117 +61,80 @@ SUB_COLUMNS = (
 )
 
 
-Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the results, by the name of the frame they make
+def own(what: str) -> cached_property[pd.DataFrame]:
+    """Return a frame that a study's and the paper's results each make of their own. what: it has, in words."""
+
+    def make(results: Results) -> pd.DataFrame:
+        raise NotImplementedError(f"{type(results).__name__} makes no frame with {what}")
+
+    return cached_property(make)
 
 
-class LazyFrame:
-    """A frame of `Results`, made when first read: by their maker of its name, by `derive`, or the rows of `table`."""
-
-    def __init__(
-        self, doc: str = "", *, table: Table | None = None, derive: Callable[[Results], pd.DataFrame] | None = None
-    ) -> None:
-        self.__doc__, self.table, self.derive = doc or (f"{table.name.upper()} rows." if table else ""), table, derive
-
-    def __set_name__(self, owner: type[Results], name: str) -> None:
-        self.name = name
-
-    def __get__(self, results: Results, owner: type[Results]) -> pd.DataFrame:
-        if self.name not in results.made:
-            results.made[self.name] = self._make(results)
-        return results.made[self.name]
-
-    def _make(self, results: Results) -> pd.DataFrame:
-        make = results.makers.get(self.name, self.derive)
-        if make is not None:
-            return make(results)
-        if self.table is None:
-            raise NotImplementedError(f"{type(results).__name__} has no maker of {self.name!r}")
-        return results.rows(self.table)
+def of_table(table: Table) -> cached_property[pd.DataFrame]:
+    """Return a frame that holds the rows of a table."""
+    return cached_property(lambda results: results.rows(table))
 
 
 class Results:
     """One set of results; a frame has no rows if its part was not run.
 
-    A new frame is an attribute here, and a function of that name in the `makers` of a study's and the paper's results.
+    A new frame is an attribute here, made when first read, and where it is `own`, one of both kinds of results.
     """
 
     source = ""  # in words, for titles
     is_study = False
     judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
-    makers: ClassVar[Makers] = {}
     mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
-    board = LazyFrame(table=LEADERBOARD)
-    cells = LazyFrame("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
-    overall = LazyFrame(
+    board = of_table(LEADERBOARD)
+    cells = own("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
+    overall = own(
         "One row per (model, regime) that has all four datasets: the columns of cells without dataset, and j; a study's"
         " rows also have j_std, the intervals and ranks of LEADERBOARD. epoch joins the datasets' epochs by +."
     )
-    rates = LazyFrame(
-        "RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled)."
-    )
-    sub_scenarios = LazyFrame("SUB_COLUMNS: means over models, one row per sub-scenario.")
-    sub_cells = LazyFrame("One row per (model, dataset, regime) and sub-scenario (column scope).")
-    labels = LazyFrame(
-        "Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models."
-    )
-    agreement = LazyFrame(table=AGREEMENT)
-    bias = LazyFrame(table=JUDGE_BIAS)
-    leave_one_out = LazyFrame(table=LEAVE_ONE_OUT)
-    robust = LazyFrame(table=ROBUST)
-    hypotheses = LazyFrame(table=HYPOTHESES)
-    graded = LazyFrame(table=GRADED_CUTS)
-    contrasts = LazyFrame(table=CONTRASTS)
-    regime_tests = LazyFrame(table=REGIME_TESTS)
-    confabulation = LazyFrame(table=CONFABULATION_PREVALENCE)
-    validation = LazyFrame(table=JUDGE_VALIDATION)
-    human_row = LazyFrame(table=HUMAN_ROW)
-    human_agreement = LazyFrame(table=HUMAN_AGREEMENT)
-    panel_errors = LazyFrame(table=PANEL_ERRORS)
-    corrected = LazyFrame(table=CORRECTED)
-    composition = LazyFrame("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
-    prompted_probes = LazyFrame("PROBES rows under every prompt.", table=PROBES)
-    prompted_baselines = LazyFrame("PROBE_BASELINES rows under every prompt.", table=PROBE_BASELINES)
-    probes = LazyFrame(
-        "PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.",
-        derive=lambda results: _of_probe_prompt(results.prompted_probes),
-    )
-    cosines = LazyFrame("COSINES rows at the steered layer of each model.")
-    effects = LazyFrame(
-        "STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label."
-    )
-    baselines = LazyFrame(
-        "PROBE_BASELINES rows under PROBE_PROMPT.", derive=lambda results: _of_probe_prompt(results.prompted_baselines)
-    )
-    gate = LazyFrame(table=GATE)
-    risk_coverage = LazyFrame(table=RISK_COVERAGE)
-    patching = LazyFrame(table=PATCHING)
-    own_effects = LazyFrame(
-        "STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.",
-        derive=lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)),
-    )
-    nulls = LazyFrame(table=STEERING_NULLS)
-    steering_pecs = LazyFrame(table=STEERING_PECS)
-    shares = LazyFrame(table=STEERING_SHARES)
-    steering_regimes = LazyFrame(
-        "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
-    )
-    lens = LazyFrame(table=LENS)
-    sentences = LazyFrame(table=SENTENCES)
-    item_scores = LazyFrame("ITEM_SCORES rows under PROBE_PROMPT.", table=ITEM_SCORES)
-    steering_families = LazyFrame(
-        "Rows of `mechanism.effects.family_asymmetry`.",
-        derive=lambda results: effects.family_asymmetry(results.effects),
-    )
-    steering_domains = LazyFrame(
-        "Rows of `mechanism.effects.domains`.", derive=lambda results: effects.domains(results.effects)
-    )
-    steering_layers = LazyFrame(
-        "Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects)
-    )
+    rates = own("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
+    sub_scenarios = own("SUB_COLUMNS: means over models, one row per sub-scenario.")
+    sub_cells = own("One row per (model, dataset, regime) and sub-scenario (column scope).")
+    labels = own("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
+    agreement = of_table(AGREEMENT)
+    bias = of_table(JUDGE_BIAS)
+    leave_one_out = of_table(LEAVE_ONE_OUT)
+    robust = of_table(ROBUST)
+    hypotheses = of_table(HYPOTHESES)
+    graded = of_table(GRADED_CUTS)
+    contrasts = of_table(CONTRASTS)
+    regime_tests = of_table(REGIME_TESTS)
+    confabulation = of_table(CONFABULATION_PREVALENCE)
+    validation = of_table(JUDGE_VALIDATION)
+    human_row = of_table(HUMAN_ROW)
+    human_agreement = of_table(HUMAN_AGREEMENT)
+    panel_errors = of_table(PANEL_ERRORS)
+    corrected = of_table(CORRECTED)
+    composition = own("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
+    prompted_probes = of_table(PROBES)  # under every prompt
+    prompted_baselines = of_table(PROBE_BASELINES)  # under every prompt
+    # PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.
+    probes = cached_property(lambda results: _of_probe_prompt(results.prompted_probes))
+    cosines = own("COSINES rows at the steered layer of each model.")
+    effects = own("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
+    baselines = cached_property(lambda results: _of_probe_prompt(results.prompted_baselines))
+    gate = of_table(GATE)
+    risk_coverage = of_table(RISK_COVERAGE)
+    patching = of_table(PATCHING)
+    # STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.
+    own_effects = cached_property(lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)))
+    nulls = of_table(STEERING_NULLS)
+    steering_pecs = of_table(STEERING_PECS)
+    shares = of_table(STEERING_SHARES)
+    steering_regimes = cached_property(lambda results: effects.regime_matrix(results.effects))
+    lens = of_table(LENS)
+    sentences = of_table(SENTENCES)
+    item_scores = of_table(ITEM_SCORES)  # under PROBE_PROMPT alone
+    steering_families = cached_property(lambda results: effects.family_asymmetry(results.effects))
+    steering_domains = cached_property(lambda results: effects.domains(results.effects))
+    steering_layers = cached_property(lambda results: effects.sweep(results.effects))
 
     def __init__(self) -> None:
-        self.made: dict[str, pd.DataFrame] = {}
         self.kept: dict[str, list[PrintedTable]] = {}  # the tables of the catalogue that were made of them, by name
         # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
         self.refused: dict[str, list[str]] = {}

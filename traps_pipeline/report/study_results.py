@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -18,8 +17,6 @@ from traps_pipeline.report.result_frames import (
     CELL_COLUMNS,
     RATE_COLUMNS,
     SUB_COLUMNS,
-    LazyFrame,
-    Makers,
     Results,
     joined,
 )
@@ -129,19 +126,17 @@ class StudyResults(Results):
 
     source = "this study"
     is_study = True
-    metrics = LazyFrame("METRICS rows of the pairs; arms enter no table or figure.")
-    makers: ClassVar[Makers] = {
-        "metrics": lambda results: _of_panel(results, results.tables.read_all(METRICS, dataset=DATASETS)),
-        "cells": _cells,
-        "overall": _overall,
-        "rates": _rates,
-        "sub_cells": lambda results: _scoped(results, "sub_scenario"),
-        "sub_scenarios": _sub_scenarios,
-        "labels": lambda results: analyses.accuracy_by_label(_scoped(results, "label")),
-        "composition": _composition,
-        "cosines": _cosines,
-        "effects": _effects,
-    }
+    # METRICS rows of the pairs; arms enter no table or figure.
+    metrics = cached_property(lambda results: _of_panel(results, results.tables.read_all(METRICS, dataset=DATASETS)))
+    cells = cached_property(_cells)
+    overall = cached_property(_overall)
+    rates = cached_property(_rates)
+    sub_cells = cached_property(lambda results: _scoped(results, "sub_scenario"))
+    sub_scenarios = cached_property(_sub_scenarios)
+    labels = cached_property(lambda results: analyses.accuracy_by_label(_scoped(results, "label")))
+    composition = cached_property(_composition)
+    cosines = cached_property(_cosines)
+    effects = cached_property(_effects)
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()

@@ -34,7 +34,6 @@ class ProbeSettings(BaseModel):
     """How probes are fitted and resampled (docs/spec.md 7)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    solver: Literal["exact", "sklearn"] = "exact"
     folds: int = Field(default=5, ge=2)
     shuffles: int = Field(default=20, ge=20, description="with fewer the mean says little")
     resamples: int = Field(default=1000, ge=100)

@@ -35,6 +35,7 @@ from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import Sampling, load_local_model
 from traps_pipeline.models.local.checkpoint import weight_bytes
+from traps_pipeline.models.local.decoding import decode
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import batches
 from traps_pipeline.models.local.sampling import SeededNucleus
@@ -92,13 +93,16 @@ def test_every_frame_is_shown_and_none_is_sampled_again() -> None:
 
 
 @each_family
-def test_neither_the_cache_nor_a_batch_nor_padding_changes_an_answer(family: Family) -> None:
+def test_neither_the_cache_nor_a_batch_nor_padding_changes_an_answer(
+    family: Family, monkeypatch: pytest.MonkeyPatch
+) -> None:
     of, prompts = model(family), three_prompts(family)
     assert len({prompt.n_tokens for prompt in prompts}) == 3
     together = tokens(of.generate(prompts, 10))
-    assert together == tokens(of.generate(prompts, 10, use_cache=False))
     assert together == [tokens(of.generate([prompt], 10))[0] for prompt in prompts]
     assert len(set(together)) > 1
+    monkeypatch.setattr(of.network.generation_config, "use_cache", False)
+    assert together == tokens(of.generate(prompts, 10))
 
 
 def test_a_sampled_answer_depends_on_its_seed_and_not_on_its_batch() -> None:
@@ -142,16 +146,15 @@ def test_a_batch_that_does_not_fit_is_halved_and_answers_stay_the_same(monkeypat
     of, prompts = model("qwen3-vl"), three_prompts("qwen3-vl")
     expected = tokens(of.generate(prompts, 6))
     sizes: list[int] = []
-    whole = of._one_batch
     most = 1
 
-    def small(rows: Any, *rest: Any) -> Any:
+    def small(of: Any, rows: Any, *rest: Any) -> Any:
         sizes.append(len(rows))
         if len(rows) > most:
             raise torch.OutOfMemoryError
-        return whole(rows, *rest)
+        return decode(of, rows, *rest)
 
-    monkeypatch.setattr(of, "_one_batch", small)
+    monkeypatch.setattr("traps_pipeline.models.local.model.decode", small)
     assert tokens(of.generate(prompts, 6)) == expected
     assert Counter(sizes) == {3: 1, 1: 3, 2: 1}
     most = 0

@@ -193,13 +193,13 @@ def test_a_failure_is_raised_by_every_call_of_the_batch(tmp_path: Path) -> None:
 def test_a_batch_that_nobody_waits_for_any_more_ends_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     of, media = entry("llava-next-video", max_new_tokens=2000), MediaStore(tmp_path)
     asked, seen = request(of, media, QUESTIONS[0]), []
-    whole = LocalModel._one_batch
+    whole = LocalModel.generate
 
-    def watched(self: LocalModel, *rest: Any) -> Any:
-        seen.extend(whole(self, *rest))
+    def watched(self: LocalModel, *rest: Any, **named: Any) -> Any:
+        seen.extend(whole(self, *rest, **named))
         return seen
 
-    monkeypatch.setattr(LocalModel, "_one_batch", watched)
+    monkeypatch.setattr(LocalModel, "generate", watched)
 
     async def given_up() -> None:
         backend = LocalBackend(of)

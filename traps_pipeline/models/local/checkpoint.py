@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import math
 import re
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -155,13 +153,13 @@ def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> floa
 
 
 def _shapes(file: Path) -> list[Sequence[int]]:
+    from safetensors import SafetensorError, safe_open
+
     try:
-        with file.open("rb") as stream:
-            (size,) = struct.unpack("<Q", stream.read(8))
-            header: dict[str, Any] = json.loads(stream.read(size))
-    except (OSError, ValueError, struct.error, MemoryError, OverflowError) as error:
+        with safe_open(file, framework="np") as tensors:
+            return [tensors.get_slice(name).get_shape() for name in tensors.keys()]  # noqa: SIM118 - no mapping
+    except (OSError, SafetensorError) as error:
         raise TrapsError(f"{file}: no safetensors file ({error}); download or save the checkpoint again") from error
-    return [tensor["shape"] for name, tensor in header.items() if name != "__metadata__"]
 
 
 def free_bytes(device: str) -> float:

@@ -48,7 +48,6 @@ def decode(
     max_new_tokens: int,
     sampling: Sampling | None,
     steering: Steers | None,
-    use_cache: bool,
     stopped: Callable[[], bool],
 ) -> tuple[list[list[int]], list[dict[int, float]]]:
     """Return the tokens behind each prompt, those behind an answer's end included, and the log-probabilities of its
@@ -63,7 +62,6 @@ def decode(
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,
-            use_cache=use_cache,
             logits_processor=transformers.LogitsProcessorList(processors),
             stopping_criteria=transformers.StoppingCriteriaList([_Stopping(stopped)]),
         )

@@ -216,7 +216,6 @@ class LocalModel:
         sampling: Sampling | None = None,
         steering: Steers | None = None,
         *,
-        use_cache: bool = True,
         stopped: Callable[[], bool] = lambda: False,
     ) -> list[Generated]:
         """Return an answer to each prompt, in order; greedy unless sampling is given. Batches are sized to memory, and
@@ -231,7 +230,7 @@ class LocalModel:
             pending = [group]
             while pending:
                 rows = pending.pop()
-                generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, use_cache, stopped)
+                generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
                 if generated is None:
                     half = len(rows) // 2
                     pending += [rows[half:], rows[:half]]
@@ -246,21 +245,16 @@ class LocalModel:
         max_new_tokens: int,
         sampling: Sampling | None,
         steering: Steers | None,
-        use_cache: bool,
         stopped: Callable[[], bool],
     ) -> list[Generated] | None:
         """Return the answers of a batch; None if it must be halved."""
         import torch
 
+        batch = [prompts[i] for i in rows]
+        sampling, steering = sampling and sampling.rows(rows), steering and steering.rows(rows)
         try:
-            return self._one_batch(
-                [prompts[i] for i in rows],
-                max_new_tokens,
-                sampling.rows(rows) if sampling else None,
-                steering.rows(rows) if steering else None,
-                use_cache,
-                stopped,
-            )
+            tokens, first = decode(self, batch, max_new_tokens, sampling, steering, stopped)
+            return [self._answer(*one) for one in zip(batch, tokens, first, strict=True)]
         except torch.OutOfMemoryError:
             if len(rows) == 1:
                 raise TrapsError(
@@ -271,18 +265,6 @@ class LocalModel:
         torch.cuda.empty_cache()  # outside the handler: the failed pass is freed by now
         progress.current().note(f"{self.checkpoint.name}: {len(rows)} rows do not fit into memory, trying half of them")
         return None
-
-    def _one_batch(
-        self,
-        prompts: Sequence[Prompt],
-        max_new_tokens: int,
-        sampling: Sampling | None,
-        steering: Steers | None,
-        use_cache: bool,
-        stopped: Callable[[], bool],
-    ) -> list[Generated]:
-        rows, first = decode(self, prompts, max_new_tokens, sampling, steering, use_cache, stopped)
-        return [self._answer(*one) for one in zip(prompts, rows, first, strict=True)]
 
     def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> Generated:
         eos = self.network.generation_config.eos_token_id

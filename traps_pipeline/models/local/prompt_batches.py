@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -25,15 +23,6 @@ class Prompt:
     def n_tokens(self) -> int:
         """Tokens of the prompt, those of the clip included."""
         return self.inputs["input_ids"].shape[1]
-
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of the inputs: equal for equal prompts about equal clips."""
-        hasher = hashlib.sha256()
-        for name, value in sorted(self.inputs.items()):
-            hasher.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-            hasher.update(value.detach().cpu().contiguous().numpy().tobytes())
-        return hasher.hexdigest()
 
     @property
     def sequences(self) -> list[str]:

@@ -99,7 +99,9 @@ def build_tiny(
     vision: fields of the two configurations. video: fields of the video processor. The same arguments give the same
     weights.
     """
-    transformers, torch = load_transformers(), _torch()
+    import torch
+
+    transformers = load_transformers()
     wrapped = make_tokenizer(family, tokenizer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -290,9 +292,3 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
                 vision_feature_select_strategy="default",
                 num_additional_image_tokens=1,
             )
-
-
-def _torch() -> Any:
-    import torch
-
-    return torch

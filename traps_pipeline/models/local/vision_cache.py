@@ -37,12 +37,10 @@ class _Features:
 
 @dataclass(eq=False)
 class ClipMemory:
-    """Features by clip, the latest ones. passes: clips that went through the vision tower; used: clips that did not
-    have to."""
+    """Features by clip, the latest ones. passes: clips that went through the vision tower."""
 
     most_bytes: int = MOST_BYTES
     passes: int = 0
-    used: int = 0
     _kept: OrderedDict[str, _Features] = field(default_factory=OrderedDict)
     _size: int = 0
     _form: Any = None  # the library's class of outputs, and whether its tokens come as a tuple
@@ -68,9 +66,7 @@ class ClipMemory:
             keys = [_key(clip) for clip in clips]
             rows = {key: self._kept[key] for key in keys if key in self._kept}
             for key, clip in zip(keys, clips, strict=True):
-                if key in rows:
-                    self.used += 1
-                else:
+                if key not in rows:
                     rows[key] = self._pass(original, key, {**arguments, **clip, **rest})
             return self._joined([rows[key] for key in keys])
 

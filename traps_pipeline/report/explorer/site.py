@@ -24,7 +24,6 @@ import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.base.terminal import finalized
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
@@ -37,6 +36,7 @@ from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import said_by_people
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
@@ -281,25 +281,19 @@ def script() -> str:
 
 def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: bool = False) -> str:
     """Return the page that opens the explorer. It may load scripts and clips of its own folder, and nothing else."""
-    import jinja2
-
     style = (WEB / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
-    environment = jinja2.Environment(
-        autoescape=True, finalize=finalized, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
-    )
-    template = environment.from_string((WEB / "index.html.j2").read_text(encoding="utf-8"))
-    return template.render(
+    return environment(WEB).get_template("index.html.j2").render(
         title=f"{load_release().name}: {workspace.study.name}", version=stamp, style=style, style_digest=digest,
         script=SCRIPT, data=DATA, clips_at=clips_at, report=REPORT if report else "",
     )  # fmt: skip
 
 
-def parquet_text(table: pa.Table, level: int = 9) -> str:
+def parquet_text(table: pa.Table) -> str:
     """Return a table as a Parquet file (zstd) in base64."""
     stream = io.BytesIO()
     pq.write_table(
-        table.replace_schema_metadata(None), stream, compression="zstd", compression_level=level,
+        table.replace_schema_metadata(None), stream, compression="zstd", compression_level=9,
         data_page_size=_PAGE_BYTES, dictionary_pagesize_limit=_PAGE_BYTES, row_group_size=max(len(table), 1),
         write_statistics=False, store_schema=False,
     )  # fmt: skip

@@ -22,7 +22,6 @@ from traps_pipeline.report.tables.inside_columns import (
     few,
     few_note,
     interval,
-    other_probes,
     path_names,
     short_names,
     why,
@@ -100,8 +99,7 @@ _NOTES = (
 def _beside(results: Results) -> PrintedTable:
     rows = beside(results)
     rows = rows.assign(path=path_names(rows))
-    others = [Column(name, name.capitalize(), "fraction") for name in other_probes(results)]
-    columns = [MODEL, PATH, *_PROBE, *others, *_BASELINES, *SIDES]
+    columns = [MODEL, PATH, *_PROBE, *_BASELINES, *SIDES]
     notes = [
         *_NOTES,
         "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, ordered
-from traps_pipeline.report.writing import NONE, Column, PrintedTable, fraction
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, ordered
+from traps_pipeline.report.writing import Column, PrintedTable, fraction
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,7 +21,11 @@ def graded(results: Results) -> list[PrintedTable]:
     not knowing them, by answering too often and by abstaining too often."""
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]
-    shown = {f"{name}_shown": [_figure(row, name) for row in rows.to_dict("records")] for name in ("points", "brier")}
+    two_digits = partial(fraction, digits=2)
+    shown = {
+        f"{name}_shown": [figure_with_interval(row, name, two_digits) for row in rows.to_dict("records")]
+        for name in ("points", "brier")
+    }
     rows = ordered(rows.assign(**shown), ["regime", "model"])
     columns = [
         MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
@@ -52,8 +56,3 @@ def _notes(rows: pd.DataFrame) -> list[str]:
         f"on them: answering the largest from {ANSWER_FROM:g} on",
         "brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen; no part of any other figure",
     ]
-
-
-def _figure(row: Mapping[Any, Any], name: str) -> str:
-    own, low, high = (fraction(row[column], 2) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
-    return own if NONE in (own, low) else f"{own} [{low}, {high}]"

@@ -81,14 +81,9 @@ def by_features(results: Results) -> pd.DataFrame:
 
     rows = results.baselines
     wide = rows.pivot_table(index=AT, columns="features", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise", *other_probes(results)]))
+    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"]))
     spread = rows.loc[rows["features"] == "noise"].set_index(AT)["spread"]
     return wide.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(AT, object))
-
-
-def other_probes(results: Results) -> list[str]:
-    """Return the further probes of the states that experiments name, as features of `probe_baselines`."""
-    return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
 
 
 def against(results: Results, analysis: str) -> pd.DataFrame:
