@@ -1,4 +1,4 @@
-"""`traps benchmark`: certificates computed again, fresh samples of the benchmark, commitments to them and proofs."""
+"""`traps benchmark`: recompute certificates, sample new benchmarks, commit to them and prove commitments."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
     from traps_pipeline.release.commitment import Commitment
     from traps_pipeline.scenes.worlds.spec import SceneSpec
 
-# `scenes.parts.look.PARTS`, which takes long to import.
+# Copied from `scenes.parts.look.PARTS`, which takes long to import.
 LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of benchmarks."""
+    """Add the `traps benchmark` commands."""
     text = "compute every certificate of the released records again"
     parser = commands.add("benchmark certify", certify, text, example="--families plinko", workspace=False, json=True)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
-    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
+    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="certify only these (default: all)")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
     parser.add_argument(
-        "--fresh", action="store_true", help="certify all again, also scenarios that an earlier call has certified"
+        "--fresh", action="store_true", help="certify all again, also those that an earlier call certified"
     )
 
     text = "sample a fresh benchmark, certified like the released one"
@@ -68,7 +68,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
     parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
-    parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
+    parser.add_argument("--without-drawing", action="store_true", help="check --specs alone, without drawing it again")
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
 
@@ -178,7 +178,7 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
 def _not_drawn(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
-    """Return what the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
+    """Return what the seed does not reproduce here, and whether only this machine's arithmetic explains it."""
     from traps_pipeline.release.commitment import other_arithmetic, same_scene
 
     if problems and specs is not None and {*specs} == {*drawn} and all(same_scene(specs[i], drawn[i]) for i in specs):

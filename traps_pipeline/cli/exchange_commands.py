@@ -1,4 +1,4 @@
-"""`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`: calls that are made elsewhere."""
+"""`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`: make calls elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    """Add the exports and imports."""
+    """Add the export and import commands."""
     text = "write an experiment's missing calls and their media to a folder"
     parser = commands.add("study export-requests", export_calls, text, example="demo --out requests")
     add_experiment(parser)
@@ -26,22 +26,22 @@ def add(commands: Commands) -> None:
         help="with --batch: write media to the folder media/, and refer to it under this address (https, gs, file ...)",
     )  # fmt: skip
 
-    text = "write the votes that are missing as the judges' batch files"
+    text = "write the missing votes as the judges' batch files"
     parser = commands.add("study export-votes", export_votes, text, example="paper --out votes")
     add_experiment(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of batches/")
     text = "import a provider's batch of votes into the ledger"
     parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl")
     add_experiment(parser)
-    parser.add_argument("file", type=Path, help="what came back")
+    parser.add_argument("file", type=Path, help="the returned file")
 
     text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
     parser = commands.add("study import-answers", import_given, text, example="demo answers.jsonl --model oracle")
     add_experiment(parser)
-    parser.add_argument("file", type=Path, help="what came back")
-    parser.add_argument("--model", help="who answered, in a file by item (default: the experiment's only model)")
-    parser.add_argument("--run", type=whole(1, 1_000), default=1, help="of a file by item (default: 1)")
-    parser.add_argument("--key", type=Path, help="of the held-out set whose items a file names")
+    parser.add_argument("file", type=Path, help="the returned file")
+    parser.add_argument("--model", help="the model, for a file by item (default: the experiment's only model)")
+    parser.add_argument("--run", type=whole(1, 1_000), default=1, help="the run, for a file by item (default: 1)")
+    parser.add_argument("--key", type=Path, help="key of the held-out set that the file answers")
     parser.add_argument(
         "--errors", choices=("drop", "keep"), help="texts that look like error messages: leave them out, or import them"
     )
