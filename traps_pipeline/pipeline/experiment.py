@@ -1,4 +1,4 @@
-"""An experiment: models and the questions that they are asked, as a YAML file in `assets/experiments` or elsewhere."""
+"""An experiment: the models and questions of a YAML file, in `assets/experiments` or elsewhere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(BaseModel):
-    """What `traps plan` counts and `traps run` runs; benchmark, scenarios, per_family and panel become the study's."""
+    """The fields of an experiment's file. benchmark, scenarios, per_family and panel are copied to the study."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name = Field(pattern=r"^[a-z0-9-]+$")
@@ -104,7 +104,7 @@ class Experiment(BaseModel):
 
     @property
     def study(self) -> Study:
-        """The study in a new workspace for this experiment."""
+        """The study of a new workspace for this experiment."""
         fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd", "model_budgets_usd")
         fields += ("allow_unknown_prices", "mechanism", "judged_by_rules")
         values = {name: getattr(self, name) for name in fields}
@@ -112,14 +112,14 @@ class Experiment(BaseModel):
 
     @property
     def asked(self) -> Asked:
-        """The experiment's datasets, models, regimes and runs, in the form that the study keeps."""
+        """The experiment's datasets, models, regimes and runs, in the study's format."""
         values = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
         return Asked(**values, mechanism=self.mechanism is not None)
 
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
         """Return the study with the panel of the command, else of the experiment, else of a study (None: new).
 
-        Raises TrapsError for none, for two, and where rules would judge models that they are not made for unasked.
+        Raises TrapsError for no panel, for two, and if rules would judge models without an explicit request.
         """
         base = study or self.study
         if panel is not None and self.panel not in (None, panel):
@@ -148,7 +148,10 @@ class Experiment(BaseModel):
             )
 
     def cells(self) -> list[Cell]:
-        """Return all cells, by model; one with fewer runs has fewer. Raises TrapsError for an unknown model."""
+        """Return all cells, by model; a model with fewer runs has fewer cells.
+
+        Raises TrapsError for an unknown model.
+        """
         cells = []
         for model in self.models:
             available = get_model(model).runs

@@ -19,7 +19,9 @@ from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VI
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-RENDERS = RunResources(memory_gb=0.6, each_gb=0.4)  # measured: 0.4 GB of the process, 0.35 of each that draws
+RENDERS = RunResources(
+    memory_gb=0.6, each_gb=0.4
+)  # measured: 0.4 GB for the process, 0.35 GB for each rendering worker
 _stage = partial(stage, group="benchmark")
 _source = partial(source, group="benchmark", kinds=["json"], scheme=CATEGORY)
 category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
@@ -87,8 +89,10 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
     ],
 )
 def scene_specs(workspace: Workspace, category: str) -> StageOutput:
-    """Return scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated
-    here, once."""
+    """Return scenarios of a category after corrections, one row each.
+
+    A scenario with corrected parameters is simulated here, once.
+    """
     rows, resolved = build_specs(workspace, category)
     return StageOutput(rows, beside=resolved)
 
@@ -122,8 +126,10 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
     ],
 )
 def videos(workspace: Workspace, category: str) -> StageOutput:
-    """Return control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
-    whichever of the processes that are at it."""
+    """Return control and void clips of a category, one row each.
+
+    Each clip is rendered once, from its frozen trajectory, by one of the processes working on the category.
+    """
     rows, leaks = clips.build_videos(workspace, category)
     return StageOutput(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
 
