@@ -1,4 +1,4 @@
-"""Published values that follow from other published values, recomputed and compared (`traps results audit`).
+"""Recompute published values from other published values, and compare (`traps results audit`).
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
 possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or
@@ -30,8 +30,7 @@ _AGREEING = (AGREES, ROUNDING)
 
 @dataclass(frozen=True)
 class Finding:
-    """One published statement, the value that the published tables give for it, and the line of the paper's source
-    that it comes from."""
+    """A published statement, the value recomputed from the published tables, and its line in the paper's source."""
 
     group: str
     statement: str
@@ -61,8 +60,10 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return the findings for a terminal: every claim, every difference, and counts of the rest; with `everything`,
-    all."""
+    """Return the findings as text: every claim, every difference, and counts of the rest.
+
+    everything: list the rest, too.
+    """
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
@@ -78,7 +79,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def counts_text(findings: pd.DataFrame) -> str:
-    """Return how many statements agree, differ with a declaration, and disagree, as a sentence."""
+    """Return a sentence with the numbers of statements that agree, differ as declared, and differ."""
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
     agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
@@ -173,8 +174,7 @@ _REPLICATION = models_of(group="replication")
 
 
 def pecs_factors() -> Iterator[Finding]:
-    """Yield PECS of every cell against its printed factors, within the range that averaging over runs and rounding
-    allow.
+    """Yield PECS of every cell against its printed factors, within averaging and rounding errors.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
     deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
@@ -246,7 +246,7 @@ def probe_means() -> Iterator[Finding]:
 
 
 def transfer_types() -> Iterator[Finding]:
-    """Yield printed transfer types against the definitions."""
+    """Yield printed transfer types against their definitions."""
     for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
             ours, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
@@ -259,8 +259,11 @@ def transfer_types() -> Iterator[Finding]:
 
 
 def steering_means() -> Iterator[Finding]:
-    """Yield the regime table of gemma-4-e4b against the means of its dose table, which the paper calls a verification
-    run with a smaller budget whose rates lie below. (Of qwen3-vl-8b the claims make the same comparison.)"""
+    """Yield the regime table of gemma-4-e4b against the means of its dose table.
+
+    The paper calls the latter a verification run with a smaller budget and lower rates. (For qwen3-vl-8b the claims
+    make the same comparison.)
+    """
     prompts = {"direction_family": "all", "direction_regime": "standard", "inference_regime": "guided"}
     (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
     for side in ("control", "void"):
@@ -278,9 +281,9 @@ def steering_means() -> Iterator[Finding]:
 
 
 def steering_families() -> Iterator[Finding]:
-    """Yield the regime table's figures over all paths against the means of its two source families, of four paths each.
+    """Yield the regime table's figures over all paths against the means of its two source families of four paths.
 
-    The table does not say under which prompt the families' directions were read; the guided ones are assumed.
+    The table does not name the prompt of the families' directions; the guided ones are assumed.
     """
     rows = published("steering_regime").query("inference_regime == 'guided' and direction_regime != 'standard'")
     for model, group in rows.groupby("model", sort=False):
@@ -332,7 +335,7 @@ def composition_sums() -> Iterator[Finding]:
 
 
 def contradictions() -> Iterator[Finding]:
-    """Yield statements of the paper's text that another of its places contradicts, which no arithmetic decides."""
+    """Yield statements that contradict another place of the paper's text, where no arithmetic decides."""
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
         yield Finding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

@@ -1,4 +1,4 @@
-"""All figures of a leaderboard from verdicts, as the stages of the scoring group make them one after another."""
+"""Compute all figures of a leaderboard from verdicts, as the stages of the scoring group do one after another."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Scored:
 
 
 def score(verdicts: pd.DataFrame) -> Scored:
-    """Return the figures of VERDICTS rows of the pairs, of any models, regimes and runs."""
+    """Return the METRICS and LEADERBOARD rows of VERDICTS rows of the pairs (any models, regimes and runs)."""
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
     resampled = resample(verdicts)
     paired = contrasts(resampled, cells, verdicts)
