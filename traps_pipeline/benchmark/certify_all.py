@@ -18,7 +18,7 @@ from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.benchmark.composition import load_composition, problems
-from traps_pipeline.benchmark.foretelling import AT_MOST, FEWEST, foretold
+from traps_pipeline.benchmark.outcome_leakage import AT_MOST, FEWEST, outcome_leakage
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -119,11 +119,13 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
     for family, members in families.items():
         outcomes = [spec.ground_truth for spec in members]
         predicted = (
-            foretold([states[spec.scenario_id] for spec in members], outcomes) if len(members) >= FEWEST else None
+            outcome_leakage([states[spec.scenario_id] for spec in members], outcomes)
+            if len(members) >= FEWEST
+            else None
         )
         if predicted is not None and predicted.gain > AT_MOST:
             problems.append(
-                f"{family}: the state at the cut foretells {predicted.best:.3f} of the outcomes, the commonest one is "
+                f"{family}: the state at the cut predicts {predicted.best:.3f} of the outcomes, the commonest one is "
                 f"{predicted.prior:.3f}; at most {AT_MOST} more is allowed"
             )
     return problems
