@@ -1,5 +1,4 @@
-"""A gate in memory, which decides about prompts that are shown to a model now: the same probe and threshold as those
-that the gate stage counts, for a notebook."""
+"""A fitted gate for live prompts in a notebook, with the probe and threshold that the gate stage evaluates."""
 
 from __future__ import annotations
 
@@ -27,8 +26,10 @@ Threshold = Literal["mid", "J", "conformal"]
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """A gate: a probe of the states at a layer, whose score above the threshold means abstaining. pooling: of the
-    states that it was fitted on. made_of: digest of these states and of what else decided it."""
+    """A probe of the states at a layer and its threshold: a score above it means abstaining.
+
+    pooling: of the states that it was fitted on. made_of: digest of these states and of all other inputs of the fit.
+    """
 
     layer: int
     probe: Scorer
@@ -37,7 +38,7 @@ class Gate:
     made_of: str
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
-        """Return the probe's log-odds of void for a prompt: one pass of the plain model."""
+        """Return the probe's log-odds of void for a prompt, from one pass of the plain model."""
         with model.remembering_clips():
             states = model.forward_states(prompt, self.pooling).raw[self.layer]
         return float(self.probe.scores(states[None])[0])
@@ -47,9 +48,7 @@ class Gate:
         return self.score(model, prompt) > self.threshold
 
     def answer(self, model: LocalModel, prompt: Prompt, max_new_tokens: int = 512) -> str:
-        """Return the model's greedy answer to a prompt, or ABSTENTION where the gate abstains, without generating
-        any.
-        """
+        """Return the model's greedy answer to a prompt, or ABSTENTION, without generating, if the gate abstains."""
         return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
 
 
@@ -65,10 +64,9 @@ def fitted_gate(
 ) -> Gate:
     """Return a gate of a source, one of `gate.SOURCES`, fitted on the study's stored states.
 
-    target: the dataset that `other datasets` leaves out. layer: that of the gate stage by default. without: scenarios,
-    or families as `gate.families` names them, that the gate must not have seen. Raises TrapsError for another source or
-    threshold, for a source without both sides in as many scenarios as there are folds, and for states that are means
-    over a part of the prompt.
+    target: the dataset that `other datasets` leaves out. layer: default: that of the gate stage. without: scenarios, or
+    families as `gate.families` names them, to hold out. Raises TrapsError for another source or threshold, for a source
+    without both sides in as many scenarios as there are folds, and for states that are means over a part of the prompt.
     """
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     if threshold not in THRESHOLDS:

@@ -1,7 +1,7 @@
-"""What a model's states and its output say of each item, beside its verdict: encoded, and expressed or not.
+"""Compare a model's states and its output item by item, beside its verdict: encoded, and expressed or not.
 
-Every score of states is of a probe that was not fitted on the item's scenario, at the layer that is chosen without the
-item's dataset, counted from the probe's own mid threshold (half-way between the sides' means).
+Every score of states comes from a probe that was fitted without the item's scenario, at the layer chosen without the
+item's dataset, relative to the probe's own mid threshold (half-way between the sides' means).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Probes besides the regression of the protocol, for `traps_pipeline.inside.protocol`, and the erasure of a concept."""
+"""Alternative probes for `traps_pipeline.inside.protocol`, and the erasure of a concept."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, standardiser
 
 
 def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
-    """Return the probe whose weights are the difference of the sides' standardised means; 0 lies half-way between
-    them.
+    """Return the probe whose weights are the difference of the sides' standardised means.
+
+    A score of 0 lies half-way between them.
     """
     mean, scale = standardiser(np.asarray(states, float))
     standard = (states - mean) / scale
@@ -23,8 +24,10 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
 
 
 def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """Return a probe of any scikit-learn classifier or pipeline; make: returns a new one. Scores are its decision
-    function, or the log-odds of its probabilities."""
+    """Return a fit function for any scikit-learn classifier or pipeline; make: returns a new one.
+
+    Scores are its decision function, or the log-odds of its probabilities.
+    """
 
     def fit(states: np.ndarray, void: np.ndarray) -> Scorer:
         return _Estimator(make().fit(states, void))
@@ -45,10 +48,11 @@ class _Estimator:
 
 @dataclass(frozen=True, eq=False)
 class Eraser:
-    """Least-squares concept erasure for one binary concept (LEACE, of Belrose et al. 2023): the smallest change of
-    states, in the metric of their own covariance, after which both sides have the same mean.
+    """Least-squares concept erasure for one binary concept (LEACE, of Belrose et al. 2023).
 
-    mean: (d,), of the states that it was fitted on. read, written: (d,), what of a state is taken out, and along what.
+    It is the smallest change of states, in the metric of their own covariance, after which both sides have the same
+    mean. mean: (d,), of the fitted states. read, written: (d,), the component that is read from a state, and the one
+    subtracted.
     """
 
     mean: np.ndarray
@@ -57,7 +61,7 @@ class Eraser:
 
     @staticmethod
     def of(states: np.ndarray, void: np.ndarray) -> Eraser:
-        """Return the erasure of which side an item is on, from states (n, d) and void (n,)."""
+        """Return the eraser of the side of an item, fitted on states (n, d) and void (n,)."""
         states = np.asarray(states, float)
         mean, label = states.mean(axis=0), void - np.mean(void)
         left, size, right = np.linalg.svd(states - mean, full_matrices=False)

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 SITES: tuple[Site, ...] = ("residual", "attention", "mlp")
-ROWS, TOKENS = 64, 2**14  # patches in one pass: at most so many, and fewer of long prompts
+ROWS, TOKENS = 64, 2**14  # maximum number of patches in one pass; fewer for long prompts
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +63,12 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """The decoder's part of a pass.
+    """The recorded decoder part of a pass.
 
-    inputs: what the decoder was called with, after the vision tower. states: by site and layer, (T, d); the residual
-    stream always, other sites as asked for. margin: the outcome. pictures: which tokens are visual, (T,) bool.
-    per_layer: what each block was given of the token's own, (T, width), empty for a model without that. shared: by
-    name, the layer that made keys and values which later blocks read, and these, (1, heads, T, width).
+    inputs: the decoder's arguments, after the vision tower. states: by site and layer, (T, d); always the residual
+    stream, other sites on request. margin: the outcome. pictures: which tokens are visual, (T,) bool. per_layer: each
+    block's per-token input vector, (T, width), empty for a model without it. shared: by name, the layer whose keys and
+    values later blocks read, and these, (1, heads, T, width).
     """
 
     inputs: Mapping[str, Any]
@@ -80,18 +80,18 @@ class Recorded:
 
     @property
     def length(self) -> int:
-        """Tokens."""
+        """The number of tokens."""
         return int(self.inputs["inputs_embeds"].shape[1])
 
     @property
     def visual(self) -> np.ndarray | None:
-        """Where deepstack features are added, (T,) bool; None for a model that has none."""
+        """The positions that deepstack features are added at, (T,) bool; None for a model without any."""
         mask = self.inputs.get("visual_pos_masks")
         return None if mask is None else mask[0].cpu().numpy()
 
 
 def require_patchable(model: LocalModel) -> None:
-    """Raise TrapsError for a model whose later blocks read more of earlier ones than is replaced here."""
+    """Raise TrapsError for a model whose later blocks read more of earlier ones than this module replaces."""
     unknown = unknown_path(model.network.config.get_text_config(), model.blocks[0])
     if unknown:
         raise TrapsError(
@@ -117,9 +117,9 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
 
 
 def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> Recorded:
-    """Run one pass and keep what a patch may take from it, at the residual stream and at `sites`.
+    """Run one pass and keep what a patch may need, at the residual stream and at `sites`.
 
-    tokens: those that begin an abstention. Raises TrapsError for a block that hands on more than the residual stream.
+    tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
     """
     import torch
 
@@ -171,9 +171,9 @@ def patched_changes(
     """Measure the change of the target's outcome by each patch from the source, (patches,).
 
     Passes begin at the lowest patched block of their rows; the vision tower is not run again. Every pass has one row
-    without a patch, and changes are against that row: a patch that replaces states by equal ones changes nothing, bit
-    for bit, whatever the size of the batch does to rounding. Raises TrapsError when the two prompts have another number
-    of tokens, or other visual positions.
+    without a patch, and changes are relative to that row: a patch that replaces states by equal ones changes nothing,
+    bit for bit, whatever the batch size does to rounding. Raises TrapsError if the two prompts have different numbers
+    of tokens, or different visual positions.
     """
     import torch
 
@@ -227,15 +227,14 @@ def _require_one_form(target: Recorded, source: Recorded) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """Return the layer whose recorded state a patched pass can begin with. Raises TrapsError for a site that is not
-    there."""
+    """Return the layer whose recorded state a patched pass can start from. Raises TrapsError for an unknown site."""
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1
 
 
 def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
-    """Return the weights of a pass with one row for each patch behind a row without any."""
+    """Return the weights of a pass: one row without a patch, then one row per patch."""
     import torch
 
     masks: dict[tuple[Site, int], Tensor] = {}
@@ -246,15 +245,13 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
 
 def _behind(weights: Weights, layer: int) -> Tensor | None:
-    """Return the weights of residual patches at a layer or below it, which are all behind them."""
+    """Return the weights of residual patches up to a layer, which affect all later layers."""
     parts = [part for (site, at), part in weights.items() if site == "residual" and at <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
 def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
-    """Return states (rows, .., T, d), of which the source's, (T, d) or (1, .., T, d), take the part that weights
-    say.
-    """
+    """Return states (rows, .., T, d), mixed with the source's, (T, d) or (1, .., T, d), by weights."""
     import torch
 
     weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
@@ -271,7 +268,7 @@ def _margins(
     rows: int,
     tokens: Sequence[int],
 ) -> Tensor:
-    """Return the outcomes (rows,) of a pass over so many copies of the target, from the state at layer `start` on."""
+    """Return the outcomes (rows,) of a pass over several copies of the target, from the state at layer `start` on."""
     inputs = _repeated(target, rows)
     if ("residual", 0) in weights:
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
@@ -287,7 +284,7 @@ def _margins(
 
 
 def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
-    """Return the decoder's inputs for so many rows of one prompt."""
+    """Return the decoder's inputs for several rows of one prompt."""
     import torch
 
     length, inputs = target.length, dict(target.inputs)
@@ -305,7 +302,7 @@ def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
 def _replacing(
     model: LocalModel, target: Recorded, source: Recorded, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
-    """Let passes begin behind block `start` and take what weights say from the source; all is undone at the end."""
+    """Let passes start behind block `start` and replace states by the source's; undo everything at the end."""
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
         states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])

@@ -31,7 +31,7 @@ class Split:
     scenario: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Split:
-        """Return the chosen items; chosen is a mask or indices."""
+        """Return the selected items; chosen is a mask or indices."""
         return Split(self.states[chosen], self.void[chosen], self.scenario[chosen])
 
 
@@ -51,7 +51,7 @@ class Probe:
 
 
 class Scorer(Protocol):
-    """What is fitted: anything that scores states, higher for void."""
+    """A fitted scorer of states, higher for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
         """Return scores (n,) of states (n, d)."""
@@ -64,8 +64,10 @@ Fit = Callable[[np.ndarray, np.ndarray], Scorer]  # states (n, d), void (n,) boo
 
 
 def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and population standard deviation of each column, (d,) each. As in scikit-learn's StandardScaler the
-    deviation is 1 where a column is constant up to rounding."""
+    """Return mean and population standard deviation of each column, (d,) each.
+
+    As in scikit-learn's StandardScaler the deviation is 1 for a column that is constant up to rounding.
+    """
     mean, variance = states.mean(axis=0), states.var(axis=0)
     rounding = len(states) * np.finfo(float).eps
     constant = variance <= rounding * variance + (rounding * mean) ** 2
@@ -73,7 +75,7 @@ def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_probe(states: np.ndarray, void: np.ndarray, solver: Solver = "exact", penalty: float = PENALTY) -> Probe:
-    """Return the probe of states (n, d) with labels (n,). Raises TrapsError when one class has no item."""
+    """Return the probe of states (n, d) with labels (n,). Raises TrapsError if one class has no item."""
     _check_labels(void)
     states = np.asarray(states, float)
     mean, scale = standardiser(states)
@@ -102,14 +104,16 @@ def _reference(standard: np.ndarray, void: np.ndarray, penalty: float) -> tuple[
 
 
 def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> tuple[np.ndarray, float]:
-    """Return the logistic regression with an unpenalised intercept, by its Gram matrix (n, n): dual coefficients (n,)
-    and intercept. The coefficients of the columns are the rows' transpose times the dual.
+    """Return the logistic regression with an unpenalised intercept, by its Gram matrix (n, n).
 
-    At the minimum the dual is penalty * (label - probability) and sums to 0. Newton's step solves
-    (I + W gram) step + W intercept_step = residual of that condition, with W = penalty * p (1 - p), through
-    I + sqrt(W) gram sqrt(W), whose eigenvalues are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved
-    until the objective falls. A factorisation is used again while each step with it reduces the residual to a fifth or
-    less, since W hardly changes near the minimum. Raises TrapsError for states that are not finite.
+    The result is the dual coefficients (n,) and the intercept. The coefficients of the columns are the rows' transpose
+    times the dual.
+
+    At the minimum the dual is penalty * (label - probability) and sums to 0. Newton's step solves (I + W gram) step + W
+    intercept_step = residual of that condition, with W = penalty * p (1 - p), through I + sqrt(W) gram sqrt(W), whose
+    eigenvalues are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved until the objective falls. A
+    factorisation is reused while each step with it reduces the residual to a fifth or less, since W hardly changes near
+    the minimum. Raises TrapsError for states that are not finite.
     """
     from scipy.special import expit
 
@@ -180,9 +184,9 @@ def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np
 
 
 def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,). Ties count half.
+    """Return the area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,).
 
-    By mean ranks (Mann and Whitney). NaN where one class has no item.
+    Ties count half, by mean ranks (Mann and Whitney). NaN if one class has no item.
     """
     from scipy.stats import rankdata
 
@@ -197,12 +201,12 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Return percentile interval of the AUROC from resampled scenarios, with the probe held fixed, and with a floor:
-    where all resamples agree (a probe that separates 16 pairs), percentiles would say that the value is certain.
+    """Return the percentile interval of the AUROC from resampled scenarios, with a minimum width.
 
-    The floor is the exact binomial one. If a share s of n scenarios fails, none of them fails with probability
-    (1 - s)^n; so with n scenarios of the scarcer side, an interval reaches down to at least ((1 - level) / 2)^(1/n),
-    which is .79 for 16, and up to at least 1 minus that.
+    The probe is held fixed. If all resamples agree (a probe that separates 16 pairs), percentiles alone would claim
+    certainty, so the exact binomial bound is the minimum: if a share s of n scenarios fails, none of them fails with
+    probability (1 - s)^n; so with n scenarios of the scarcer side, an interval reaches down to at least ((1 - level) /
+    2)^(1/n), which is .79 for 16, and up to at least 1 minus that.
 
     weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,), the
     column of `weights` for each item. A resample in which a class is empty is dropped.
@@ -224,9 +228,9 @@ def auroc_interval(
 
 
 def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """Return the fold of each item, (n,) int: items of a scenario share one, and folds differ by one scenario at most.
+    """Return the fold of each item, (n,) int: a scenario's items share one; fold sizes differ by at most one scenario.
 
-    Raises TrapsError when there are fewer scenarios than folds.
+    Raises TrapsError if there are fewer scenarios than folds.
     """
     names = np.unique(scenario)
     if len(names) < folds:
@@ -274,8 +278,10 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: So
 
 
 def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
-    """Return whether each of states (n, d) is assigned to void, (n,) bool, by the source's standardiser and centroids
-    and by cosine distance; with equal distances it is assigned to control."""
+    """Return whether each of states (n, d) is assigned to void, (n,) bool, by cosine distance to the centroids.
+
+    Standardiser and centroids are the source's; with equal distances a state is assigned to control.
+    """
     _check_labels(source.void)
     known = np.asarray(source.states, float)
     mean, scale = standardiser(known)
@@ -292,7 +298,9 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Return scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source. No label
-    of a target is read."""
+    """Return scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source.
+
+    No label of a target is read.
+    """
     probes = {source: fit(layer[source].states, layer[source].void) for source in {s for s, _ in pairs}}
     return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

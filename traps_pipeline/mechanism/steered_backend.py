@@ -1,6 +1,6 @@
-"""A local model that answers with a direction added to one block: the backend of steered requests.
+"""The backend of steered requests: a local model that answers with a direction added to one block.
 
-Requests of one layer are generated together; what another process of the machine has made of them is taken from it
+Requests of one layer are generated together; answers that another process of the machine has generated are reused
 (`made_answers`).
 """
 
@@ -26,8 +26,7 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block, each row with a direction and an alpha of its
-    own."""
+    """A local model that answers with a direction added to one block; each row has its own direction and alpha."""
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: MadeAnswers) -> None:
         super().__init__(entry)
@@ -35,13 +34,13 @@ class SteeredBackend(LocalBackend):
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread, but for what another process has made of it."""
+        """Answer a batch, in the worker thread, except for answers from another process."""
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
         """Answer requests; rows of one layer are generated together, and unsteered rows apart.
 
-        stopped: asked at every token, ends early.
+        stopped: called at every token, ends generation early.
         """
         from traps_pipeline.mechanism.hook import Steering
 
@@ -73,12 +72,11 @@ class SteeredBackend(LocalBackend):
         return load_local_model(self._entry, inside=True)
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
-        """Return a processed prompt, kept in memory; `digest` identifies the frames, so a re-rendered clip is a new
-        prompt."""
+        """Return a processed prompt, cached in memory; `digest` identifies the frames."""
         frames = sample(clip, self._spec)
         return self._model().prompt(system, user, frames.frames, frames.times_s.tolist())
 
 
 def _asked(request: Request) -> tuple[Any, str | None, str, str]:
-    """Return what a request's prompt depends on."""
+    """Return the part of a request that its prompt depends on."""
     return request.media, request.media_digest, request.system, request.user
