@@ -226,7 +226,7 @@ def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling)
 
 
 def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
-    """Return the tokens over which states are pooled; None for `last`, `mean` and `answer`. Raises TrapsError if none."""
+    """Return the tokens over which states are pooled; None if the pooling needs no mask. Raises TrapsError if none."""
     if pooling not in OF_PARTS:
         return None
     parts = spans(model, prompt, item.about["system"], item.about["question"])
