@@ -1,4 +1,4 @@
-"""Which frames of a clip a model is shown in a dataset that varies them (docs/hypotheses.md)."""
+"""Choose the frames of a clip that a model is shown in a dataset that varies them (docs/hypotheses.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CLIP_S = 5  # of a whole clip (docs/spec.md 2)
 
 
 def framed(spec: MediaSpec, dataset: str) -> MediaSpec:
-    """Return how a model is shown the clips of a dataset: as its entry says, or with other frames."""
+    """Return the media settings for a dataset's clips: as in the entry, or with other frames."""
     if dataset in _RATES:
         rate = _RATES[dataset]
         return spec.model_copy(update={"fps": float(rate), "uniform": None, "most": rate * CLIP_S})
@@ -19,6 +19,6 @@ def framed(spec: MediaSpec, dataset: str) -> MediaSpec:
 
 
 def observed(dataset: str) -> FramePolicy:
-    """Return the frames from which the observer answers: 5 a second, or as the dataset varies them."""
+    """Return the frames that the observer answers from: 5 a second, or as the dataset varies them."""
     spec = framed(MediaSpec(profile="frames", fps=5), dataset)
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later)

@@ -15,17 +15,17 @@ from traps_pipeline.video.policies import FramePolicy
 
 @lru_cache(maxsize=100_000)
 def seen(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
-    """Return what the observer says of these frames of a clip; one look serves all regimes and runs."""
+    """Return the observer's answer from these frames of a clip, cached for all regimes and runs."""
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question, frames)
 
 
 class ObserverBackend:
-    """Looks at the clip with classical vision; sees neither the record nor the simulator."""
+    """Answers by classical vision on the clip; sees neither the record nor the simulator."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt; see `Backend`."""
+        """Return the outcome of one attempt; see `Backend`."""
         assert request.media is not None, "the observer is asked about clips"
         frames = observed(dataset_of(str(request.about["item_id"])))
         answer = await asyncio.to_thread(seen, request.media_digest, request.media, request.user, frames)

@@ -7,8 +7,10 @@ from typing import Any
 
 
 def structured(name: str, **properties: Any) -> dict[str, Any]:
-    """Return the `response_format` of an object with exactly these properties (JSON schema of each), all of them
-    required."""
+    """Return the `response_format` of an object with exactly these properties, all of them required.
+
+    properties: the JSON schema of each.
+    """
     return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": _object(**properties)}}
 
 
