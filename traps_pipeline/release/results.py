@@ -1,4 +1,4 @@
-"""A study's leaderboard in the forms that others collect: the hub's `.eval_results`, Every Eval Ever, plain Parquet."""
+"""Export a study's leaderboard: the hub's `.eval_results`, Every Eval Ever, and plain Parquet."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
-OURS = "traps-pipeline"  # makes the reference models
+OURS = "traps-pipeline"  # developer of the reference models
 EVER_SCHEMA = "0.3.0"  # of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
@@ -37,23 +37,24 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Who:
-    """Who made the evaluation, and who develops the models that are no reference models."""
+    """The evaluating organization, and the developer of all models except reference models."""
 
     organization: str = "unknown"
     developer: str = "unknown"
 
     def made(self, model: str) -> str:
-        """Return who made a model."""
+        """Return a model's developer."""
         return OURS if is_reference(model) else self.developer
 
 
 def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) -> list[str]:
-    """Write the overall figures of every model that has them, and all rows as Parquet; returns the files.
+    """Write the overall figures of every model that has them, and all rows as Parquet; return the files.
 
-    dataset: the repository that holds the release, as the hub names it.
+    dataset: the repository of the release, as the hub names it.
+
     `eval_results/MODEL.yaml` goes into the model's repository as `.eval_results/traps.yaml`, with a task for each
-    regime; `data/` is laid out as Every Eval Ever's, with each figure and its interval. Raises TrapsError where there
-    is no overall figure.
+    regime; `data/` has the layout of Every Eval Ever, with each figure and its interval. Raises TrapsError if there is
+    no overall figure.
     """
     if not _REPOSITORY.fullmatch(dataset):
         raise TrapsError(f"--dataset {dataset!r:.80}: is no repository of the hub; write it as OWNER/NAME")
@@ -75,7 +76,7 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
         record = _ever_record(str(model), entries, dataset, who, when, release)
-        name = uuid.UUID(digest(record)[:32], version=4)  # the collection wants random ones; these are the content's
+        name = uuid.UUID(digest(record)[:32], version=4)  # in the form of the random ids that the collection asks for
         files.append(f"{EVER}/{release.name}/{who.made(str(model))}/{model}/{name}.json")
         write_text(target / files[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     write_bytes(target / PARQUET, table_bytes(LEADERBOARD, board))

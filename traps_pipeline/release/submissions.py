@@ -1,4 +1,4 @@
-"""A leaderboard of many submissions: each is verified, and those of the same items and panel are ranked together."""
+"""A leaderboard of submissions: verify each, and rank those with the same items and panel together."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ TITLE = "TRAPSBench: submissions"
 
 @dataclass(frozen=True)
 class Accepted:
-    """A submission without a problem, and what its verification found."""
+    """A submission without problems, and its verification."""
 
     submission: Submission
     verified: Verified
 
     @property
     def name(self) -> str:
-        """As it calls itself."""
+        """The submission's own name."""
         return self.submission.about.name
 
     @property
     def group(self) -> tuple[str, str]:
-        """The digest of its items, and its panel: with which submissions it may be ranked."""
+        """The digest of its items, and its panel: submissions with the same group are ranked together."""
         items = self.submission.table(ITEMS)
         about = self.submission.about
         return digest(sorted(items["item_hash"]))[:16], id_of_seats(about.panel, about.judges)
@@ -48,7 +48,7 @@ class Accepted:
 
 @dataclass(frozen=True)
 class Refused:
-    """A file that is not ranked, and why."""
+    """A file that is not ranked, with the reason."""
 
     name: str
     problems: Sequence[str]
@@ -56,7 +56,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Group:
-    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission where names repeat."""
+    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission if names repeat."""
 
     items: str
     panel: str
@@ -67,7 +67,7 @@ class Group:
 
     @property
     def title(self) -> str:
-        """What its entries have in common, in words."""
+        """The common properties of its entries, in words."""
         return f"Benchmark {self.versions}, {self.n_items} items ({self.items[:8]}), panel {self.panel}"
 
 
@@ -81,7 +81,7 @@ class Board:
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
-    """Verify submissions and rank those that hold. Raises TrapsError where two have one name, and where none holds."""
+    """Verify submissions and rank the valid ones. Raises TrapsError if two have one name, and if none is valid."""
     board = Board()
     for path in paths:
         try:
@@ -127,7 +127,7 @@ def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
 
 def _verdicts(one: Accepted) -> pd.DataFrame:
     verdicts = one.verified.verdicts
-    assert verdicts is not None  # without verdicts there is a problem, and it is not accepted
+    assert verdicts is not None  # a submission without verdicts has a problem, and is not accepted
     return verdicts
 
 

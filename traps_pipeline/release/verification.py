@@ -1,5 +1,6 @@
-"""Verification of a submission: its votes are cast again where that needs no key, every number is computed again from
-them, and items, prompts and media are held against a release. What cannot be checked is said.
+"""Verify a submission: recast its votes if that needs no key, recompute every number, and compare with a release.
+
+Items, prompts and media are compared with the release's. The result names what cannot be checked.
 """
 
 from __future__ import annotations
@@ -38,16 +39,19 @@ from traps_pipeline.scoring.scored import Scored, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
 
-SHOWN = 10  # sentences of one kind; the others are counted
-CLOSE = 1e-9  # figures of another machine's linear algebra may differ in their last digits
+SHOWN = 10  # sentences per kind; further ones are counted
+CLOSE = 1e-9  # tolerance: linear algebra of another machine may differ in the last digits
 _SAME = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
 Row = Mapping[str, Any]
 
 
 @dataclass
 class Verified:
-    """What verification found: problems, each a sentence; what was checked, and what could not be. verdicts and scored:
-    made again from the votes, None where that is impossible."""
+    """The result of a verification.
+
+    problems: one sentence each; checked and unchecked: what was verified, and what could not be. verdicts and scored:
+    recomputed from the votes, None if that is impossible.
+    """
 
     problems: list[str] = field(default_factory=list)
     checked: list[str] = field(default_factory=list)
@@ -56,7 +60,7 @@ class Verified:
     scored: Scored | None = None
 
     def look(self, what: str, complaints: Iterator[str]) -> None:
-        """Note a check, and its problems, of which the first are kept and the others counted."""
+        """Record a check and its problems: keep the first ones and count the others."""
         problems = list(complaints)
         self.checked.append(what)
         self.problems += problems[:SHOWN]
@@ -65,7 +69,7 @@ class Verified:
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verified:
-    """Verify a submission, against a released folder if given. Raises TrapsError for a release that cannot be read."""
+    """Verify a submission, against a released folder if given. Raises TrapsError for an unreadable release."""
     verified = Verified()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
@@ -229,12 +233,12 @@ def _rules_on(task: str, user: str) -> Outcome:
 
 
 def _cast_again(request: Request) -> Outcome:
-    """Return what the rules make of a request: they read its text and its task alone."""
+    """Return the rules' vote on a request, of which they read only the text and the task."""
     return _rules_on(str(request.about["task"]), request.user)
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from what it must be; an item of another kind than it says decides nothing."""
+    """Return how a vote differs from the correct one; an item with a wrong kind decides nothing."""
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:
@@ -242,7 +246,7 @@ def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _difference(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from what it must be, in words; empty where it does not."""
+    """Return how a vote differs from the correct one, in words; empty if it does not."""
     decision = "abstained" if row["task"] == "abstention" else "correct"
     if again is not None:
         vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
@@ -265,7 +269,7 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _numbers(verified: Verified, submission: Submission) -> None:
-    """Compute verdicts, metrics and leaderboard from the votes; note how the submission's numbers differ from them."""
+    """Compute verdicts, metrics and leaderboard from the votes; record how the submission's numbers differ."""
     own = id_of_seats(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))

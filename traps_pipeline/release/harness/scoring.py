@@ -1,4 +1,4 @@
-"""An answer to figures, with the standard library alone: the reading of texts, the panel of rules, and PECS."""
+"""Score answers with only the standard library: read texts, apply the rule panel, and compute PECS."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ DATASETS = (
     "chaotic_ill_posed",
     "occlusion",
     "occlusion_ill_posed",
-)  # in the order in which means are summed
+)  # means are summed in this order
 RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What the panel decided about an answer. outcome: what the text amounts to, UNREAD where the rules cannot read
-    it; abstained, correct: None where nothing is decided, and correct on every void."""
+    """The panel's decision about an answer.
+
+    outcome: the kind of text, UNREAD if the rules cannot read it; abstained, correct: None if undecided; correct is
+    None on every void.
+    """
 
     item_id: str
     dataset: str
@@ -40,14 +43,14 @@ class Judged:
 
     @staticmethod
     def of(record: Mapping[str, Any]) -> Judged:
-        """Return inverse of `vars`."""
+        """Return the decision from its fields (the inverse of `vars`)."""
         return Judged(**{name: record[name] for name in Judged.__dataclass_fields__})
 
 
 def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> Judged:
     """Return the panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
 
-    The three seats of the panel `rules` read by the same rules, so that one reading is their majority.
+    All three judges of the panel `rules` read by the same rules, so one reading is their majority.
     """
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
     read = read_answer({**row, "text": text}, None, regime)
@@ -66,9 +69,11 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
 
 
 def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
-    """Return Acc, AbsRec, FalseAbs, J and PECS of one run: `DATASET_FIGURE` of each dataset, and FIGURE overall, the
-    equal-weight mean over the four datasets, None unless all four are there; `missing`, items without a decision, and
-    `unread`, those of them whose text the rules could not read.
+    """Return Acc, AbsRec, FalseAbs, J and PECS of one run.
+
+    Keys: `DATASET_FIGURE` for each dataset, and FIGURE overall, the equal-weight mean over the four datasets, None
+    unless all four are present; `missing`, the number of undecided items, and `unread`, those among them that the rules
+    could not read.
     """
     rows = list(judged)
     results: dict[str, float | None] = {}
