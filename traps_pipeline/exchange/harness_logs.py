@@ -1,7 +1,7 @@
-"""Answers by item, as other harnesses log them: inspect_ai's logs, lmms-eval's samples, and lines of one's own.
+"""Read answers by item from other harnesses' logs: inspect_ai's, lmms-eval's samples, and plain lines.
 
-They name an item and a regime, not a ledger key. Whoever imports them says which model of the experiment answered, and
-in which run. All of it is data from elsewhere: sizes are bounded, nothing is executed.
+They name an item and a regime, not a ledger key. The importing user says which model of the experiment answered, and in
+which run. All of it is untrusted data: sizes are bounded, nothing is executed.
 """
 
 from __future__ import annotations
@@ -23,19 +23,22 @@ from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
 from traps_pipeline.models.usage import Sizes, read_usage
 
 MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
-# What an ending means of an answer in a log; one that is asked again is an error.
+# Outcome by finish reason in a log; an error is asked again.
 OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
-LOG = ".eval"  # ends the name of a log of inspect_ai in its own format
+LOG = ".eval"  # suffix of inspect_ai's own log format
 Reader = Callable[[Path], Iterator["Given"]]
 
 
 @dataclass(frozen=True)
 class Given:
-    """An answer to an item. where: file and line or sample, for complaints. item: its id, or its opaque name in a
-    held-out set. answer: fields of `exchange.Answer` but its key. run: None where the file does not say. epoch: how
-    often the harness had asked, from 1. has_failed: the call brought no answer, so that the item stays missing."""
+    """An answer to an item from a harness's log.
+
+    where: file and line or sample, for messages. item: its id, or its opaque name in a held-out set. answer: fields of
+    `exchange.Answer` except its key. run: None if the file does not say. epoch: the harness's repetition, from 1.
+    has_failed: the call brought no answer, so that the item stays missing.
+    """
 
     where: str
     item: str
@@ -47,7 +50,7 @@ class Given:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """Return what reads a file of answers by item; None for a file of answers by key, or of a provider's batch."""
+    """Return the reader for a file of answers by item; None for answers by key, or a provider's batch."""
     if path.suffix == LOG:
         return _eval_log
     if path.suffix == ".json":
@@ -80,7 +83,7 @@ def _json_log(path: Path) -> Iterator[Given]:
 
 
 def _eval_log(path: Path) -> Iterator[Given]:
-    """Yield a log is a zip with a JSON file a sample, compressed with deflate or zstd."""
+    """Yield the answers of a log in a zip, which has one JSON file per sample (deflate or zstd)."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
@@ -100,7 +103,7 @@ def _eval_log(path: Path) -> Iterator[Given]:
 
 
 def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
-    """Return an entry in zstd, which this Python's zipfile does not know. Raises ValueError."""
+    """Return an entry compressed with zstd, which this Python's zipfile does not support. Raises ValueError."""
     import pyarrow as pa
 
     raw.seek(entry.header_offset)
@@ -134,7 +137,7 @@ def _sample(where: str, sample: Any) -> Given:
 
 
 def _reasoning(message: Any) -> str | None:
-    """Return what stands in the parts of a message that are reasoning."""
+    """Return the text of a message's reasoning parts."""
     content = message.get("content") if isinstance(message, dict) else None
     parts = [part for part in content if isinstance(part, dict)] if isinstance(content, list) else []
     texts = [part.get("reasoning") for part in parts if part.get("type") == "reasoning" and not part.get("redacted")]
@@ -142,7 +145,7 @@ def _reasoning(message: Any) -> str | None:
 
 
 def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
-    """Return the tokens of a call, None where they are unknown.
+    """Return the tokens of a call, None if they are unknown.
 
     inspect_ai's providers count cached input and reasoning within `input_tokens` and `output_tokens` or beside them;
     the total tells which.
@@ -183,7 +186,7 @@ def _lmms_samples(path: Path) -> Iterator[Given]:
 
 
 def _own_lines(path: Path) -> Iterator[Given]:
-    """Yield lines with item, regime, text, and run where there are several."""
+    """Yield lines with item, regime, text, and run if there are several."""
     for number, line in read_lines(path):
         try:
             row = json.loads(line)
@@ -197,7 +200,7 @@ def _own_lines(path: Path) -> Iterator[Given]:
 
 
 def _answer(outcome: str, text: str | None) -> dict[str, Any]:
-    """Return outcome and text as the ledger has them: no text without an outcome that has one."""
+    """Return outcome and text in the ledger's form: a text only with an outcome that has one."""
     if outcome in (*WITH_TEXT, UNFINISHED) and not (text or "").strip():
         outcome = "empty"
     return {"outcome": outcome, "text": text if outcome in (*WITH_TEXT, UNFINISHED) else None}
