@@ -1,4 +1,4 @@
-"""What a correction would make asked again: items, calls and dollars, before anybody decides."""
+"""Preview the cost of a correction before it is decided: items, calls and dollars to ask again."""
 
 from __future__ import annotations
 
@@ -23,9 +23,12 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class Touched:
-    """What corrections touch: items by id, how many answers and votes are asked again at most (the ledger may know
-    some), dollars of calls over the network (None where a price is unknown), scenarios whose clips are rendered again,
-    scenarios that left and that are new, and the question after the correction."""
+    """The effect of corrections.
+
+    Items by id, the maximum number of answers and votes to ask again (the ledger may know some), dollars of calls over
+    the network (None if a price is unknown), scenarios to render again, removed and new scenarios, and the corrected
+    question.
+    """
 
     items: list[str] = field(default_factory=list)
     answers: int = 0
@@ -37,7 +40,7 @@ class Touched:
     question: str = ""
 
     def plus(self, other: Touched) -> Touched:
-        """Return both together."""
+        """Return the sum of both."""
         known = self.dollars is not None and other.dollars is not None
         return Touched(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
@@ -54,7 +57,7 @@ class Touched:
 
 
 def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
-    """Return what a correction touches of a SCENE_SPECS row. Raises TrapsError for parameters that are refused."""
+    """Return the effect of a correction on a SCENE_SPECS row. Raises TrapsError for refused parameters."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:
@@ -88,7 +91,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 
 def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
-    """Yield model, dataset of the taxonomy, and how many evaluations the study's experiments ask of it."""
+    """Yield model, dataset of the taxonomy, and the number of evaluations that the study's experiments want."""
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)

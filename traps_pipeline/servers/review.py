@@ -1,4 +1,4 @@
-"""`traps people review`: one scenario a screen, its clips in step, decisions appended to the corrections."""
+"""`traps people review`: one scenario per screen, its clips in step; decisions are appended to the corrections."""
 
 from __future__ import annotations
 
@@ -37,8 +37,10 @@ Record = Mapping[str, Any]
 
 
 class Decision(BaseModel):
-    """What a reviewer sends. seen: how many decisions about the scenario the page showed. `add` makes a new scenario of
-    the same family, with the parameters of this one and those of the changes."""
+    """A reviewer's decision. seen: the number of decisions about the scenario on the page.
+
+    `add` creates a new scenario of the same family, with this one's parameters and the changes.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
@@ -49,7 +51,7 @@ class Decision(BaseModel):
 
 
 class Undo(BaseModel):
-    """The wish to take back the last decision."""
+    """A request to take back the last decision."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
@@ -58,7 +60,7 @@ class Undo(BaseModel):
 
 
 class Preview(BaseModel):
-    """Changes whose cost a reviewer wants to know before they decide."""
+    """Changes whose cost a reviewer wants to see before deciding."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
@@ -87,12 +89,12 @@ class Review:
 
     @cached_property
     def flags(self) -> Any:
-        """`queue.flags` of the study as it was when the review began."""
+        """`queue.flags` of the study at the start of the review."""
         return flags(self.workspace)
 
     @cached_property
     def comparison(self) -> Comparison:
-        """Which control clips look alike; it begins when the queue of these is opened."""
+        """The comparison of control clips, started when the queue of near duplicates is opened."""
         differences = {
             id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
         }
@@ -101,7 +103,7 @@ class Review:
 
     @cached_property
     def observed(self) -> dict[str, str]:
-        """What the observer answered under the first regime that it was asked, by item."""
+        """The observer's answers under its first regime, by item."""
         rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
         own = rows.loc[rows["model"] == "observer"].sort_values(["item_id", "regime", "run"])
         first = own.dropna(subset=["text"]).drop_duplicates("item_id")
@@ -114,7 +116,7 @@ class Review:
         return self.specs[scenario_id]
 
     def reviewed(self) -> frozenset[str]:
-        """Return the scenarios about which a decision stands."""
+        """Return the scenarios with a valid decision."""
         last = {each.scenario_id: each for _, each in read_corrections()}
         return frozenset(id_ for id_, each in last.items() if is_reviewed([each]))
 
@@ -137,7 +139,7 @@ class Review:
             raise Conflict(str(error)) from error
 
     def _free_id(self, family: str) -> str:
-        """Return the first id from 9001 on that no scenario of the benchmark has or had."""
+        """Return the first id from 9001 on that no scenario has ever had."""
         used = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
         return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
 
@@ -150,7 +152,7 @@ class Review:
             raise Conflict(str(error)) from error
 
     def preview(self, sent: Preview) -> dict[str, Any]:
-        """Return the words after the changes, and what asking again would take. Raises NotThere and Refused."""
+        """Return the words after the changes, and the cost of asking again. Raises NotThere and Refused."""
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
         cost = touched(self.workspace, spec, correction)
@@ -167,7 +169,7 @@ class Review:
             raise Refused(f"{scenario_id}: {explain(error)}") from error
 
     def summary(self) -> Touched:
-        """Return what the decisions touch that the study's tables do not have yet."""
+        """Return the effect of the decisions that the study's tables do not contain yet."""
         scenarios = load_scenarios(self.workspace.study)
         total = Touched(added=sorted({*scenarios} - {*self.specs}))
         for scenario_id, spec in self.specs.items():
@@ -226,7 +228,7 @@ class Review:
         )
 
     def done_page(self, name: QueueName) -> str:
-        """Return the page at the end of a queue: what the decisions touch, and the commands that follow them."""
+        """Return the page at the end of a queue: the decisions' effect, and the commands that follow."""
         return page(
             "review_done.html.j2",
             touched=self.summary(),
@@ -240,7 +242,7 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """Return what shows and then asks what decisions touch, for ours or for an experiment's own file."""
+        """Return the commands that plan and run the changes, for our experiment or one from a file."""
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]
@@ -265,7 +267,7 @@ class Review:
         return jpeg.tobytes()
 
     def clip(self, scenario_id: str, side: str) -> Path:
-        """Return the file of a clip. Raises NotThere where the study has none."""
+        """Return the file of a clip. Raises NotThere if the study has none."""
         row = self.clips.get((scenario_id, side))
         if row is None:
             raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
