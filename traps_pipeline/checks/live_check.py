@@ -1,7 +1,7 @@
-"""`traps models check --live`, and the preflight of `traps run`: what would go wrong is said before money is spent.
+"""Check models and judges with live calls before money is spent: `traps models check --live`, and preflight.
 
 Each model is asked about a clip that is red and then blue, once with the clip and once without, and in its JSON form;
-each judge votes on answers whose votes are known. What goes wrong is a sentence that names the cause and the remedy.
+each judge votes on answers with known votes. Every problem is a sentence that names the cause and the remedy.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from traps_pipeline.models.thinking import how_to_declare, split_thinking, undec
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
-CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
-TIMEOUT_S, REACH_S = 25.0, 5.0  # of a call, of what is looked at before: what is wrong is named within half a minute
+CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # a name in the ledger, not a model
+TIMEOUT_S, REACH_S = 25.0, 5.0  # of a call, and of the checks before it: problems show within half a minute
 BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
@@ -63,7 +63,7 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class Live:
-    """What came of an entry. problems: what keeps its answers from being worth anything; notes: what else was seen."""
+    """The result for an entry. problems: what makes its answers worthless; notes: other observations."""
 
     entry: Entry
     problems: Sequence[str]
@@ -71,7 +71,7 @@ class Live:
 
     @property
     def line(self) -> str:
-        """What came of it, in a line for each finding."""
+        """The result as text, with one line per finding."""
         lines = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
         head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
         return redact("\n".join([head, *(f"     {line}" for line in lines)]))
@@ -84,7 +84,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry, by name. They hold the time: an answer of yesterday says nothing of today."""
+    """Return the calls to an entry, by name. They contain the time, so that yesterday's answers are not reused."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -111,9 +111,12 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 
 @dataclass(frozen=True)
 class Reached:
-    """What is found before anything is asked. problem: why asking is of no use; unlisted: that the server's own list of
-    models lacks the name; refused: that the list, which wants nothing but a key, is refused. Neither is certain: some
-    servers list what was downloaded, or examples, and a litellm proxy without a database answers 400 to a wrong key."""
+    """Findings before any call.
+
+    problem: why asking is useless; unlisted: the server's own list of models lacks the name; refused: the list, which
+    needs only a key, is refused. Neither is certain: some servers list what was downloaded, or examples, and a litellm
+    proxy without a database answers 400 to a wrong key.
+    """
 
     problem: str = ""
     unlisted: str = ""
@@ -121,7 +124,7 @@ class Reached:
 
 
 def reach(entry: Entry, account: Account) -> Reached:
-    """Look at the key, the address, and the server's own list of models if it has one."""
+    """Check the key, the address, and the server's own list of models if it has one."""
     from traps_pipeline.models.wire import get
 
     try:
@@ -149,7 +152,7 @@ def reach(entry: Entry, account: Account) -> Reached:
 
 
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """Return the sentence about an address at which nobody answers."""
+    """Return the sentence about an address without a server."""
     is_here = is_loopback(urlsplit(address).hostname or "")
     remedy = "start the server there" if is_here else "look at this machine's network and proxy variables"
     return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
@@ -171,7 +174,7 @@ def _listed(answer: Any) -> list[Any]:
 
 
 def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
-    """Return what the outcomes of `requests_of` say of an entry, and what was found before them."""
+    """Return the problems and notes from the outcomes of `requests_of`, and from the checks before them."""
     problems, notes, before = list[str](), list[str](), reached or Reached()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:
@@ -182,7 +185,7 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
         return Live(entry, [before.refused])
     for name, outcome in outcomes.items():
         if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
-            continue  # what fails without a schema, too, says nothing of schemas
+            continue  # a failure without a schema, too, says nothing about schemas
         if outcome.kind == "error":
             sentence = _failure(entry, account, name, str(outcome.error))
             if outcome.error == RATE_LIMITED and any(one.kind in WITH_TEXT for one in outcomes.values()):
@@ -235,7 +238,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
 
 
 def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
-    """Return what to declare where an answer shows its thinking between usual marks."""
+    """Return what to declare if an answer shows thinking between common marks."""
     mark = undeclared_mark(split_thinking(outcome.text or "", entry.thinking).answer)
     return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
 
@@ -280,7 +283,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
 
 
 def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
-    """Return whether the clip arrives: its two colours are named, or its tokens are counted."""
+    """Return whether the clip arrives: the answer names its two colours, or its tokens are counted."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
@@ -304,7 +307,7 @@ def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) 
 
 
 def check_live(entries: Iterable[Entry]) -> list[Live]:
-    """Ask these entries, side by side, without a study: what it costs is booked nowhere."""
+    """Ask these entries in parallel, without a study; their cost is not recorded."""
 
     async def every() -> list[Live]:
         return list(await asyncio.gather(*(one(entry) for entry in entries)))
@@ -333,9 +336,10 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
 
 
 def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[Live]:
-    """Look at prices, then ask the models and judges of a run, under its budget; the calls are in the ledger of votes.
+    """Check prices, then ask the models and judges of a run, under its budget.
 
-    Raises TrapsError where the study does not allow what somebody costs: judges are looked at before a model is asked.
+    The calls are in the ledger of votes. Raises TrapsError if the study does not allow a participant's cost: judges are
+    checked before a model is asked.
     """
     entries = [entry for entry in (*models, *judges) if entry.backend == NETWORK]
     for entry in entries:
@@ -374,7 +378,7 @@ def _outcome(row: Row) -> Outcome:
 
 
 def require_sound(results: Sequence[Live]) -> None:
-    """Raise TrapsError that names everything that is wrong with anybody."""
+    """Raise TrapsError that names every problem of every entry."""
     wrong = [f"{one.entry.id}: {problem}" for one in results for problem in one.problems]
     if wrong:
         more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
