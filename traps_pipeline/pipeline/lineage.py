@@ -34,7 +34,7 @@ class Status:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Return why it is stale, in words."""
+        """Why it is stale, in words."""
         return (*self.outdated, f"{self.failed} calls failed and can be asked again") if self.failed else self.outdated
 
 

@@ -62,7 +62,7 @@ class StageOutput:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """Return the rows of a table that is built as a frame."""
+        """The rows of a table that is built as a frame."""
         return cast("pd.DataFrame", self.content)
 
 
