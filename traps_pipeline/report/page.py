@@ -1,4 +1,4 @@
-"""The report page: findings, the leaderboard, what was run, and in one list what was not (docs/report.md)."""
+"""The report page: findings, the leaderboard, the results, and a list of what was not run (docs/report.md)."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def report_html(
 ) -> str:
     """Render the report as one page that opens from disk and makes no network request.
 
-    Cards that were run are shown, tables in a collapsed appendix; of the others the reasons are listed. With `address`
-    every number is a link to the items behind it. notes: those below the leaderboard; terms: words of the legend.
+    Cards with results are shown, tables in a collapsed appendix; for the others the reasons are listed. With `address`
+    every number links to the items behind it. notes: those below the leaderboard; terms: words of the legend.
     """
     boards = leaderboards(board, robust, notes)
-    ranked = [table for table in boards if table.title == boards[0].title]  # one for each panel
+    ranked = [table for table in boards if table.title == boards[0].title]  # one per panel
     others = [
         Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(
             own=tables_html([table], table.title, address), absent=[], published={}))

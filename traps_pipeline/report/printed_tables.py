@@ -1,4 +1,4 @@
-"""The paper's tables as the paper prints them (`assets/published`), without any arithmetic on their figures."""
+"""The paper's tables as printed (`assets/published`), without any arithmetic on their figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Trans
 
 
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
-    """Return the paper's table `name` of `tables.csv`, which has its title, its place in the paper and its notes."""
+    """Return the paper's table `name`, with title, place in the paper and notes from `tables.csv`."""
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
     where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
@@ -38,12 +38,12 @@ def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> Printe
 
 
 def figures(names: Mapping[str, str]) -> list[Column]:
-    """Return columns of figures (field: heading), which are shown as the paper prints them."""
+    """Return columns of figures (field: heading), shown as the paper prints them."""
     return [Column(field, heading, "range") for field, heading in names.items()]
 
 
 def in_text(card: str) -> list[PrintedTable]:
-    """Return the figures that stand only in the paper's text and belong to this card; no table if there are none."""
+    """Return the figures of this card that only the paper's text states; no table if there are none."""
     rows = as_printed("other").query("card == @card")
     columns = [Column("model", "Model"), Column("quantity", "Quantity")]
     columns += figures({"printed": "Value", "line": "Line"})
@@ -188,7 +188,7 @@ def composition() -> list[PrintedTable]:
 
 
 def hyperparameters() -> list[PrintedTable]:
-    """Return what all models and all judges are sent."""
+    """Return the parameters that all models and all judges are sent."""
     columns = [Column("parameter", "Parameter"), *figures({"model_calls": "VLM calls", "judge_calls": "Judge calls"})]
     rows = as_printed("hyperparameters").replace({"judge_calls": {"": "–"}})
     return [of_paper("hyperparameters", rows, columns)]
@@ -212,7 +212,7 @@ def validation() -> list[PrintedTable]:
 
 
 def confabulation() -> list[PrintedTable]:
-    """Return prevalence of the four axes in six models."""
+    """Return the prevalence of the four axes in six models."""
     rows = as_printed("confabulation_taxonomy")
     names = {"hp_pct": "HP", "ii_pct": "II", "hp_and_ii_pct": "HP∩II", "es_pct": "ES", "doubt_pct": "Doubt"}
     rows[[*names]] = rows[[*names]] + "%"
@@ -310,7 +310,7 @@ def _paths(rows: pd.DataFrame) -> pd.DataFrame:
 
 @cache
 def audit_table() -> PrintedTable:
-    """Return every statement that differs from what the paper's tables give, with its line and the arithmetic."""
+    """Return every statement that differs from the paper's tables, with its line and the arithmetic."""
     from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text  # pandas takes long to import
 
     findings = audit()

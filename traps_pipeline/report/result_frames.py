@@ -1,4 +1,4 @@
-"""The frames from which tables and figures are made, for a study or for the paper: tidy, with the same columns.
+"""The frames behind tables and figures, for a study or the paper: tidy, with the same columns.
 
 A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
 `epoch`.
@@ -61,11 +61,11 @@ SUB_COLUMNS = (
 )
 
 
-Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the results, by the name of the frame they make
+Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the results, by the name of their frame
 
 
 class LazyFrame:
-    """A frame of `Results`, made when first read: by their maker of its name, by `derive`, or the rows of `table`."""
+    """A lazily computed frame of `Results`: by the maker of its name, by `derive`, or the rows of `table`."""
 
     def __init__(
         self, doc: str = "", *, table: Table | None = None, derive: Callable[[Results], pd.DataFrame] | None = None
@@ -92,14 +92,15 @@ class LazyFrame:
 class Results:
     """One set of results; a frame has no rows if its part was not run.
 
-    A new frame is an attribute here, and a function of that name in the `makers` of a study's and the paper's results.
+    To add a frame, add an attribute here, and a function of that name in the `makers` of the study's and the paper's
+    results.
     """
 
     source = ""  # in words, for titles
     is_study = False
-    judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
+    judged_by = ""  # the judges, in words, for the notes of a study's tables and figures
     makers: ClassVar[Makers] = {}
-    mechanism: MechanismSettings | None = None  # of a study that looks inside models
+    mechanism: MechanismSettings | None = None  # of a study with mechanistic analyses
 
     board = LazyFrame(table=LEADERBOARD)
     cells = LazyFrame("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
@@ -172,7 +173,7 @@ class Results:
 
     def __init__(self) -> None:
         self.made: dict[str, pd.DataFrame] = {}
-        self.kept: dict[str, list[PrintedTable]] = {}  # the tables of the catalogue that were made of them, by name
+        self.kept: dict[str, list[PrintedTable]] = {}  # cache of the catalogue's tables, by name
         # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
         self.refused: dict[str, list[str]] = {}
 
@@ -210,7 +211,7 @@ def datasets_of(cells: pd.DataFrame) -> list[str]:
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """Return the parts below each other; without parts, a frame without rows or columns."""
+    """Return the concatenated parts; without parts, a frame without rows or columns."""
     import pandas as pd
 
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

@@ -1,4 +1,4 @@
-"""What a study found, in sentences: the first thing on its report. Every number is one of the report's tables."""
+"""A study's main findings, in sentences, for the top of its report page. Every number is in one of its tables."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def study_findings(results: Results) -> list[Finding]:
 
 
 def _best(rows: pd.DataFrame) -> Iterator[Finding]:
-    """Yield the best model of each regime, and how many others the contrasts cannot tell from it."""
+    """Yield the best model of each regime, and the number of others that the contrasts cannot separate from it."""
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
@@ -63,7 +63,7 @@ def _best(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _names(models: list[str]) -> str:
-    """Return up to three names, and how many more there are."""
+    """Return up to three names, and the number of others."""
     first, more = models[:3], len(models) - 3
     parts = [*first, f"{more} more"] if more > 0 else first
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
@@ -83,7 +83,7 @@ def _abstention(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _accuracy(rows: pd.DataFrame) -> Iterator[Finding]:
-    """Yield by how much guided prompting changes Acc and AbsRec of the models that were asked both ways."""
+    """Yield how guided prompting changes Acc and AbsRec of the models with both regimes."""
     wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
     if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
         changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
@@ -147,12 +147,12 @@ def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _span(shares: pd.Series) -> str:
-    """Return the smallest and the largest share in percent, once if they print alike."""
+    """Return the smallest and the largest share in percent, once if they print the same."""
     low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _points(changes: pd.Series) -> str:
-    """Return the smallest and the largest change in points of percent, with their signs."""
+    """Return the smallest and the largest change in percentage points, with their signs."""
     low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
     return low if low == high else f"{low} to {high}"

@@ -1,4 +1,4 @@
-"""What settles mechanistic claims: probes and baselines, the gate in the PECS plane, patching, doses among nulls."""
+"""Figures that test mechanistic claims: baselines of probes, gates in the PECS plane, patching, doses among nulls."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def patching(results: Results) -> Figure:
         raise NotRun(absent)
     sites = [site for site in SITES if site in set(rows["site"])]
     cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
-    alone = len(sites) == 1  # then cases stand side by side; else a line has the sites of one case
+    alone = len(sites) == 1  # then cases are columns; otherwise a row has the sites of one case
     across = min(2, len(cases)) if alone else len(sites)
     panels = [(case, site) for case in cases for site in sites]
     lines = -(-len(panels) // across)
@@ -246,7 +246,7 @@ def doses_among_nulls(results: Results) -> Figure:
 
 
 def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
-    """Return the p of a direction among each of its nulls at the largest dose, a line a side."""
+    """Return the p of a direction among each of its nulls at the largest dose, one line per side."""
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
     lines: list[str] = []
@@ -258,7 +258,7 @@ def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dat
 
 
 def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
-    # Doses in alpha have a figure of their own; a gap may be so small that they would set the scale of this one.
+    # Doses in alpha have their own figure; with a small gap they would dominate the scale of this one.
     rows = rows.loc[rows["unit"] == "gap"]
     for side, line, marker, ink in (("control", "-", "o", INK), ("void", "--", "s", SOFT)):
         of = rows.loc[rows["side"] == side]

@@ -1,4 +1,4 @@
-"""What a model encodes and what it expresses: states against output item by item, and the margin by layer."""
+"""Figures of encoding and expression: states against output item by item, and the margin by layer."""
 
 from __future__ import annotations
 
@@ -58,7 +58,9 @@ def states_and_output(results: Results) -> Figure:
 
 
 def scored_items(results: Results) -> pd.DataFrame:
-    """Return the items with both scores, and `sentence`: how much likelier an abstention is (nats a token, or NaN)."""
+    """Return the items with both scores, and `sentence`: by how much an abstention is likelier (nats per token, or
+    NaN).
+    """
     rows, read = results.item_scores, results.sentences
     read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
     read = read.assign(sentence=read["abstention"].astype(float) - read["own"].astype(float))
@@ -67,7 +69,7 @@ def scored_items(results: Results) -> pd.DataFrame:
 
 
 def orders(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the AUROC of states, of the output margin, and of whole sentences where they were read, on some items."""
+    """Return the AUROC of states, of the output margin, and of whole sentences if available, on some items."""
     void, areas = (rows["side"] == "void").to_numpy(), dict[str, float]()
     for name, column in (("states", "own"), ("margin", "margin"), ("sentences", "sentence")):
         values = rows[column].to_numpy(float)

@@ -1,4 +1,4 @@
-"""Probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
+"""Figures of probes and steering: probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-# A source has a colour and a line style, a target a marker, so that they differ without colour as well.
+# A source has a colour and a line style, a target a marker, so that they also differ without colour.
 COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
 LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
 MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
@@ -176,7 +176,7 @@ def dose_response(results: Results) -> Figure:
 
 
 def _answers(part: pd.DataFrame, side: str) -> str:
-    """Return how many answers a marker stands for."""
+    """Return the number of answers behind a marker."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
     return f", n {from_to(min(counts), max(counts))}" if len(counts) else ""
 

@@ -150,7 +150,7 @@ def naive(results: Results) -> list[PrintedTable]:
 
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
-    """Return cells with PECS 0: void is not told from control, or no control is answered correctly."""
+    """Return cells with PECS 0: voids are not told from controls, or no control is answered correctly."""
     rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()

@@ -1,4 +1,4 @@
-"""What models earn on graded cuts, beside an ideal observer and strategies that know nothing of a clip."""
+"""Models' earnings on graded cuts, beside an ideal observer and strategies that know nothing of a clip."""
 
 from __future__ import annotations
 

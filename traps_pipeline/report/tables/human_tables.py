@@ -1,4 +1,4 @@
-"""What people score, how far they agree, and scores corrected for the panel's errors (docs/people.md)."""
+"""Tables of people's scores and agreement, and of scores corrected for the panel's errors (docs/people.md)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PERCENT = (*SHARES, "sensitivity", "specificity")
 
 
 def people(results: Results) -> list[PrintedTable]:
-    """Return what people score on the clips, by dataset, and how far people agree about clips and answers."""
+    """Return people's scores on the clips, by dataset, and their agreement about clips and answers."""
     rows = ordered(titled(results.human_row), ["dataset"])
     rows = _with_intervals(rows, [*_FIGURES])
     figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
@@ -102,7 +102,7 @@ def _shown(row: Mapping[Any, Any], field: str) -> str:
 
 
 def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
-    """Return notes beside a leaderboard: what people score, and whether the panel was validated."""
+    """Return notes beside a leaderboard: people's scores, and whether the panel was validated."""
     return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
 
 

@@ -1,4 +1,4 @@
-"""Agreement of the judges, their bias, confabulation and its validation (docs/spec.md 4.4 and 6)."""
+"""Tables of the judges' agreement and bias, of confabulation, and of its validation (docs/spec.md 4.4 and 6)."""
 
 from __future__ import annotations
 
