@@ -30,7 +30,7 @@ import numpy as np
 from bench.quick import parse
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local.adapter import Generated, LocalModel, load_local_model
+from traps_pipeline.models.local.adapter import GeneratedAnswer, LocalModel, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.local.vision_cache import ClipMemory
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
@@ -91,14 +91,14 @@ def measure(entry: ModelEntry, chosen: argparse.Namespace) -> None:
     layer = chosen.layer or max(1, round(model.n_layers * 5 / 9))
     sheet = [*product(range(len(prompts)), range(len(vectors)), ALPHAS)]
 
-    def plain() -> list[Generated]:
-        answers = list[list[Generated]]()
+    def plain() -> list[GeneratedAnswer]:
+        answers = list[list[GeneratedAnswer]]()
         for direction, alpha in product(range(len(vectors)), ALPHAS):
             hook = Steering(vectors[direction], layer, (alpha,) * len(prompts))
             answers.append(model.generate(prompts, NEW_TOKENS, steering=hook))
         return [row[number] for number in range(len(prompts)) for row in answers]
 
-    def shipped() -> list[Generated]:
+    def shipped() -> list[GeneratedAnswer]:
         answers = []
         for start in range(0, len(sheet), ROWS):
             rows = sheet[start : start + ROWS]

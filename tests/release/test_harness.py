@@ -17,7 +17,7 @@ from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
-from traps_pipeline.exchange.answer_exchange import Whose, import_answers
+from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
@@ -76,7 +76,7 @@ def test_what_is_no_answer_is_missing_and_decides_nothing(workspace: Workspace) 
         ("answer", "Das lässt sich nicht bestimmen.", "unread"),
     ):  # fmt: skip
         judged = judge(item, outcome, text, "standard")
-        assert (judged.outcome, judged.abstained, judged.correct, judged.right) == (read, None, None, False)
+        assert (judged.outcome, judged.abstained, judged.correct, judged.is_right) == (read, None, None, False)
     shrugs = figures([judge(item, "answer", text, "standard") for text in ("", "IDK")])
     assert (shrugs["missing"], shrugs["unread"]) == (2, 1)
 
@@ -169,7 +169,7 @@ def test_a_wrong_answer_by_item_is_named_and_nothing_is_imported(
     path = tmp_path / "answers.jsonl"
     path.write_text("".join(json.dumps(line).replace('"ID"', json.dumps(id_)) + "\n" for line in lines))
     with pytest.raises(TrapsError, match=said):
-        import_answers(workspace, experiment, path, Whose("oracle"))
+        import_answers(workspace, experiment, path, AnswerContext("oracle"))
     with pytest.raises(TrapsError, match="say whose answers these are: --model, one of oracle, prior, random-50"):
         import_answers(workspace, experiment, path)
     assert workspace.answers.read("oracle__json__run1").settled == {}

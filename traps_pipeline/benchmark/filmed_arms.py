@@ -39,7 +39,7 @@ _FOUND = ".arm.json"  # suffix of the files with an arm's result
 
 
 @dataclass(frozen=True)
-class Finding:
+class ArmResult:
     """The stored result of an arm of a scenario, beside its clip. of: the digest of the record and the code."""
 
     of: str
@@ -48,11 +48,11 @@ class Finding:
     frames: int = 0
 
     @staticmethod
-    def read(path: Path, of: str) -> Finding | None:
+    def read(path: Path, of: str) -> ArmResult | None:
         """Return the stored result if it is of this record and this code, else None."""
         if not path.is_file():
             return None
-        finding = Finding(**json.loads(path.read_text(encoding="utf-8")))
+        finding = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
         return finding if finding.of == of else None
 
 
@@ -147,7 +147,7 @@ def _missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
     """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
-        finding = Finding.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in existing else None
+        finding = ArmResult.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in existing else None
         if finding is None or (finding.frames and not {clip, note_of(clip)} <= existing):
             return True
     return False
@@ -189,7 +189,7 @@ def _of(spec: SceneSpec, arm: str) -> str:
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
     """Return whether an arm lies here complete, with its clip if it has one. Raises DamagedClip."""
-    finding = Finding.read(_finding_of(clip), _of(spec, arm))
+    finding = ArmResult.read(_finding_of(clip), _of(spec, arm))
     return finding is not None and (not finding.frames or read_clip(clip) is not None)
 
 
@@ -204,9 +204,9 @@ def film(job: Job) -> int:
             take = known.film(scenario)
             if take.frames:
                 drawn += save_clip(clip, take.frames, scenario.fps)
-            finding = Finding(of, None, take.evidence, len(take.frames))
+            finding = ArmResult(of, None, take.evidence, len(take.frames))
         except Rejected as why:
-            finding = Finding(of, str(why), {})
+            finding = ArmResult(of, str(why), {})
         write_text(_finding_of(clip), json.dumps(asdict(finding)))
     return drawn
 
@@ -221,7 +221,7 @@ def _rows(
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = Finding.read(_finding_of(path), _of(spec, arm)), known.get(path)
+    finding, clip = ArmResult.read(_finding_of(path), _of(spec, arm)), known.get(path)
     if finding is None or (finding.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(

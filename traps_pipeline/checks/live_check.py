@@ -62,7 +62,7 @@ _ITEM: Mapping[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Live:
+class LiveResult:
     """The result for an entry. problems: what makes its answers worthless; notes: other observations."""
 
     entry: Entry
@@ -110,7 +110,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 
 
 @dataclass(frozen=True)
-class Reached:
+class ServerCheck:
     """Findings before any call.
 
     problem: why asking is useless; unlisted: the server's own list of models lacks the name; refused: the list, which
@@ -123,7 +123,7 @@ class Reached:
     refused: str = ""
 
 
-def reach(entry: Entry, account: Account) -> Reached:
+def reach(entry: Entry, account: Account) -> ServerCheck:
     """Check the key, the address, and the server's own list of models if it has one."""
     from traps_pipeline.models.wire import get
 
@@ -131,24 +131,24 @@ def reach(entry: Entry, account: Account) -> Reached:
         check_network()
         secret = account.secret()
     except TrapsError as error:
-        return Reached(str(error))
+        return ServerCheck(str(error))
     if account.base_url is None:
-        return Reached()
+        return ServerCheck()
     headers = {"Authorization": f"Bearer {secret}"} if secret else {}
     try:
         answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
     except TrapsError as error:
-        return Reached(nobody_at(account.base_url, plain(str(error))))
+        return ServerCheck(nobody_at(account.base_url, plain(str(error))))
     if answer.status_code in (401, 403):
-        return Reached(_wrong_key(account))
+        return ServerCheck(_wrong_key(account))
     if answer.status_code == BAD_REQUEST and account.key:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
-        return Reached(refused=f"{even}: is the one in {account.key} right?")
+        return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
     known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
     if known and model_name(entry) not in known:
         unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
-        return Reached(unlisted=unlisted)
-    return Reached()
+        return ServerCheck(unlisted=unlisted)
+    return ServerCheck()
 
 
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
@@ -173,16 +173,18 @@ def _listed(answer: Any) -> list[Any]:
     return []
 
 
-def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
+def findings(
+    entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
+) -> LiveResult:
     """Return the problems and notes from the outcomes of `requests_of`, and from the checks before them."""
-    problems, notes, before = list[str](), list[str](), reached or Reached()
+    problems, notes, before = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:
-        return Live(entry, [before.unlisted])
+        return LiveResult(entry, [before.unlisted])
     if before.unlisted:
         notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
     if before.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
-        return Live(entry, [before.refused])
+        return LiveResult(entry, [before.refused])
     for name, outcome in outcomes.items():
         if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
             continue  # a failure without a schema, too, says nothing about schemas
@@ -206,7 +208,7 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
         problems += [*_wrong_answers(entry, outcomes), *_seen(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
-    return Live(entry, list(dict.fromkeys(problems)), notes)
+    return LiveResult(entry, list(dict.fromkeys(problems)), notes)
 
 
 def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
@@ -306,17 +308,17 @@ def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) 
 # --- asking -----------------------------------------------------------------------------------------------------------
 
 
-def check_live(entries: Iterable[Entry]) -> list[Live]:
+def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
     """Ask these entries in parallel, without a study; their cost is not recorded."""
 
-    async def every() -> list[Live]:
+    async def every() -> list[LiveResult]:
         return list(await asyncio.gather(*(one(entry) for entry in entries)))
 
-    async def one(entry: Entry) -> Live:
+    async def one(entry: Entry) -> LiveResult:
         account = account_of(entry)
         reached = await asyncio.to_thread(reach, entry, account)
         if reached.problem:
-            return Live(entry, [reached.problem])
+            return LiveResult(entry, [reached.problem])
         backend = make_backend(entry)
 
         async def asked(request: Request) -> Outcome:
@@ -335,7 +337,7 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
     return asyncio.run(every())
 
 
-def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[Live]:
+def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[LiveResult]:
     """Check prices, then ask the models and judges of a run, under its budget.
 
     The calls are in the ledger of votes. Raises TrapsError if the study does not allow a participant's cost: judges are
@@ -365,7 +367,7 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     problems = []
     for entry in entries:
         if problem := reached[entry.id].problem:
-            problems.append(Live(entry, [problem]))
+            problems.append(LiveResult(entry, [problem]))
         else:
             mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
             problems.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
@@ -377,7 +379,7 @@ def _outcome(row: Row) -> Outcome:
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 
-def require_sound(results: Sequence[Live]) -> None:
+def require_sound(results: Sequence[LiveResult]) -> None:
     """Raise TrapsError that names every problem of every entry."""
     wrong = [f"{one.entry.id}: {problem}" for one in results for problem in one.problems]
     if wrong:

@@ -188,7 +188,7 @@ def model_name(entry: Entry) -> str:
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckedEntry:
     """An entry, a line about its request, and the problems of the request."""
 
     entry: Entry
@@ -196,16 +196,16 @@ class Checked:
     problems: list[str]
 
 
-def examine(entry: Entry) -> Checked:
+def examine(entry: Entry) -> CheckedEntry:
     """Send the requests of an entry to this machine and compare them."""
     if entry.backend == NETWORK:
         return _examine_network(entry)
     if isinstance(entry, ModelEntry) and entry.media is not None:
         return _examine_local(entry, entry.media)
-    return Checked(entry, f"{entry.id:<24} nothing is sent anywhere", [])
+    return CheckedEntry(entry, f"{entry.id:<24} nothing is sent anywhere", [])
 
 
-def _examine_network(entry: Entry) -> Checked:
+def _examine_network(entry: Entry) -> CheckedEntry:
     requests = requests_of(entry)
     bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
@@ -217,7 +217,7 @@ def _examine_network(entry: Entry) -> Checked:
     if isinstance(entry, ModelEntry):
         listed += _protocol_problems(entry, requests)
     first = next(iter(requests))
-    return Checked(entry, _line(entry, bodies[first], requests[first].sent), listed)
+    return CheckedEntry(entry, _line(entry, bodies[first], requests[first].sent), listed)
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
@@ -246,14 +246,14 @@ def _fields(fields: Mapping[str, Any]) -> str:
     return " ".join(f"{name.removeprefix('generationConfig.')}={value}" for name, value in shown.items())
 
 
-def _examine_local(entry: ModelEntry, spec: MediaSpec) -> Checked:
+def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
     """Check the frames that a local model is shown: nothing is sent, but frames are picked and resized."""
     frames = sample(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
     line = f"{entry.id:<24} local  {count} frames of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
     problems = list(_local_problems(frames.times_s, (width, height), spec))
-    return Checked(entry, f"{line}  {_fields(flat(entry.params))}", problems)
+    return CheckedEntry(entry, f"{line}  {_fields(flat(entry.params))}", problems)
 
 
 def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec) -> Iterator[str]:
@@ -276,7 +276,7 @@ def participants() -> dict[str, Entry]:
     return {**load_models(), **load_judges()}
 
 
-def check_named(names: Sequence[str]) -> Iterator[Checked]:
+def check_named(names: Sequence[str]) -> Iterator[CheckedEntry]:
     """Check the entries with these ids, or all that send or show something. Raises TrapsError for an unknown id."""
     known = participants()
     if unknown := [name for name in names if name not in known]:

@@ -67,11 +67,11 @@ def export_calls(arguments: argparse.Namespace) -> int:
 def import_given(arguments: argparse.Namespace) -> int:
     """See `traps study import-answers --help`."""
     from traps_pipeline.benchmark.held_out import held_out_key
-    from traps_pipeline.exchange.answer_exchange import Whose, import_answers
+    from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 
     experiment = experiment_of(arguments)
-    whose = Whose(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
-    imported = import_answers(open_workspace(arguments), experiment, arguments.file, whose, arguments.errors)
+    context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
+    imported = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
     return _imported(imported, arguments, "answers")
 
 

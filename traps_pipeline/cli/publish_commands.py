@@ -181,9 +181,9 @@ def submit(arguments: argparse.Namespace) -> int:
 
 def results(arguments: argparse.Namespace) -> int:
     """See `traps publish results --help`."""
-    from traps_pipeline.release.results import Who, write_results
+    from traps_pipeline.release.results import Attribution, write_results
 
-    target, who = arguments.folder.absolute(), Who(arguments.organization, arguments.developer)
+    target, who = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
     files = write_results(open_workspace(arguments), target, arguments.dataset, who)
     print(f"{len(files)} files in {target}")
     return OK

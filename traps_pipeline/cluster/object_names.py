@@ -46,7 +46,7 @@ _OBJECTS = sa.Table(
 
 
 @dataclass(frozen=True, slots=True)
-class Current:
+class CurrentObject:
     """The current object of a path: SHA-256, size in bytes, note, and time of the change.
 
     The time is in ns since 1970; 0 for an object that is yet to be named.
@@ -58,12 +58,12 @@ class Current:
     at_ns: int = 0
 
 
-class Names:
+class ObjectNames:
     """The paths of a study's files and their current objects. Thread-safe."""
 
     def __init__(self, database: Database, study: str) -> None:
         self._database, self._study = database, study
-        self._rows: dict[str, Current] = {}
+        self._rows: dict[str, CurrentObject] = {}
         self._sorted: list[str] = []  # names of these rows
         self._asked = set[str]()  # names in MANY that were looked up; later changes arrive in any case
         self._number, self._looked_at = -1, float("-inf")
@@ -103,9 +103,9 @@ class Names:
             if row.name not in self._rows:
                 insort(self._sorted, row.name)
             at_ns = int(row.at.timestamp() * 1e6) * 1000
-            self._rows[row.name] = Current(bytes(row.digest), row.size, row.note, at_ns)
+            self._rows[row.name] = CurrentObject(bytes(row.digest), row.size, row.note, at_ns)
 
-    def current(self, names: Collection[str]) -> dict[str, Current]:
+    def current(self, names: Collection[str]) -> dict[str, CurrentObject]:
         """Return the current objects of these names, if they have one."""
         with self._guard:
             self.look(FRESH_S)
@@ -129,7 +129,7 @@ class Names:
         condition = _OBJECTS.c.digest.is_not(None) if digests is None else _OBJECTS.c.digest.in_(digests)
         return {row.name: bytes(row.digest) for row in self._database.run(lambda c: self._select(c, condition))}
 
-    def change(self, changed: Mapping[str, Current | None], removals: int) -> int:
+    def change(self, changed: Mapping[str, CurrentObject | None], removals: int) -> int:
         """Set or remove the current objects of these names in one transaction; return `removals`.
 
         removals: the number of removals before the objects were uploaded. If there are more by now, nothing is changed,

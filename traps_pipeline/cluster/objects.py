@@ -19,7 +19,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.cluster.bucket import Bucket, object_name
 from traps_pipeline.cluster.cluster_database import Database, lease
-from traps_pipeline.cluster.object_names import Current, Names
+from traps_pipeline.cluster.object_names import CurrentObject, ObjectNames
 from traps_pipeline.storage.place import STUDY
 from traps_pipeline.storage.store import GRACE_DAYS, Lease, Store, UnusedObject, is_hidden
 
@@ -41,7 +41,7 @@ class ObjectStore(Store):
     def __init__(self, root: Path, bucket: Bucket, database: Database, study: str, anchor: bytes) -> None:
         super().__init__(root)
         self.bucket, self._database, self._study, self._anchor = bucket, database, study, anchor
-        self.names = Names(database, study)
+        self.names = ObjectNames(database, study)
         self._stored = set[tuple[bytes, int]]()  # digests of objects seen in the store, with `removals` at that time
         self._verified = set[bytes]()  # verified digests of contents in the scratch folder
 
@@ -52,15 +52,15 @@ class ObjectStore(Store):
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
-    def _known(self, paths: Iterable[Path]) -> dict[Path, Current]:
+    def _known(self, paths: Iterable[Path]) -> dict[Path, CurrentObject]:
         names = {path: self._name(path) for path in paths}
         current = self.names.current({*names.values()})
         return {path: current[name] for path, name in names.items() if name in current}
 
-    def _current(self, path: Path) -> Current | None:
+    def _current(self, path: Path) -> CurrentObject | None:
         return self._known([path]).get(path)
 
-    def _change(self, changed: Mapping[Path, Current | None], removals: int) -> None:
+    def _change(self, changed: Mapping[Path, CurrentObject | None], removals: int) -> None:
         named = {self._name(path): row for path, row in changed.items()}
         while (now := self.names.change(named, removals)) != removals:
             removals = now
@@ -95,7 +95,7 @@ class ObjectStore(Store):
     def _is_stored(self, digest: bytes) -> bool:
         return (digest, self.names.removals) in self._stored
 
-    def _put(self, content: bytes, row: Current | None, removals: int) -> bytes:
+    def _put(self, content: bytes, row: CurrentObject | None, removals: int) -> bytes:
         """Upload a content, unless it is current and still in the store; return its digest."""
         digest = sha256(content).digest()
         is_current = row is not None and row.digest == digest
@@ -104,7 +104,7 @@ class ObjectStore(Store):
         self._stored.add((digest, removals))
         return digest
 
-    def _fetched(self, row: Current, path: Path) -> Path:
+    def _fetched(self, row: CurrentObject, path: Path) -> Path:
         """Return the content of an object in the scratch folder. Raises TrapsError if it is lost or altered."""
         if self._is_cached(row.digest):
             return self._cached(row.digest)
@@ -126,7 +126,7 @@ class ObjectStore(Store):
     def bring(self, paths: Iterable[Path]) -> None:
         """See `Store`. A local file whose object is lost from the store stays."""
 
-        def one(known: tuple[Path, Current]) -> None:
+        def one(known: tuple[Path, CurrentObject]) -> None:
             path, row = known
             cached = self._cached(row.digest)
             if not self._is_cached(row.digest) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
@@ -145,7 +145,7 @@ class ObjectStore(Store):
         names = {*paths}
         known, removals = self._known(names), self.names.removals
 
-        def one(path: Path) -> tuple[Path, Current] | None:
+        def one(path: Path) -> tuple[Path, CurrentObject] | None:
             row = known.get(path)
             if row is not None and self._is_stored(row.digest) and is_same_file(path, self._cached(row.digest)):
                 return None
@@ -153,7 +153,7 @@ class ObjectStore(Store):
             digest = self._put(content, row, removals)
             link(path, self._cached(digest))
             self._verified.add(digest)
-            return None if row is not None and row.digest == digest else (path, Current(digest, len(content)))
+            return None if row is not None and row.digest == digest else (path, CurrentObject(digest, len(content)))
 
         self._change(dict(pair for pair in _side_by_side(one, names) if pair is not None), removals)
 
@@ -161,10 +161,10 @@ class ObjectStore(Store):
         """See `Store`."""
         known, removals = self._known(files), self.names.removals
 
-        def one(path: Path) -> tuple[Path, Current]:
+        def one(path: Path) -> tuple[Path, CurrentObject]:
             digest = self._put(files[path], known.get(path), removals)
             self._cache(digest, files[path], durable=durable)
-            return path, Current(digest, len(files[path]), note)
+            return path, CurrentObject(digest, len(files[path]), note)
 
         self._change(dict(_side_by_side(one, files)), removals)
         self.bring(files)

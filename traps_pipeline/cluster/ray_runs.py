@@ -26,7 +26,7 @@ from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, 
 from traps_pipeline.ledger.postgres import PATIENCE_S
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out
-from traps_pipeline.pipeline.runs import Ran, Runs, broke_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.pipeline.runs import RunOutcome, Runs, broke_off, problems_of, range_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, TALLY
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
@@ -125,7 +125,7 @@ class RayRuns(Runs):
         seconds = {key: sum(one.seconds(self._workspace, key) for one in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
 
-    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
         if ranges:
             progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
@@ -143,12 +143,12 @@ class RayRuns(Runs):
     def _submit(self, stages: Sequence[str], tags: Mapping[str, str]) -> str:
         return submit(self._instance, self._workspace.study.name, stages, tags)
 
-    def _watch(self, requests: list[str], run_ids: list[str]) -> list[Ran]:
+    def _watch(self, requests: list[str], run_ids: list[str]) -> list[RunOutcome]:
         """Report the progress of requested and existing runs until all have ended.
 
         An unreachable database ends this only after runs themselves would give up on it.
         """
-        done, seen_at = list[Ran](), time.monotonic()
+        done, seen_at = list[RunOutcome](), time.monotonic()
         try:
             while requests or run_ids:
                 try:
@@ -164,7 +164,7 @@ class RayRuns(Runs):
             raise
         return done
 
-    def _look_at(self, requests: list[str], run_ids: list[str], done: list[Ran]) -> None:
+    def _look_at(self, requests: list[str], run_ids: list[str], done: list[RunOutcome]) -> None:
         """Report these runs' progress since the last call.
 
         Created runs replace their requests; the results of ended runs are added to `done`.
@@ -230,10 +230,10 @@ class RayRuns(Runs):
                     else:
                         progress.current().partition(stored.asset_key.path[-1], stored.partition or "", tally)
 
-    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> Ran:
+    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
-            return Ran([f"{name} is in Dagster's history no more"], over_budget=False)
+            return RunOutcome([f"{name} is in Dagster's history no more"], over_budget=False)
         outcome = problems_of([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
         if run.status != dg.DagsterRunStatus.SUCCESS and not outcome.problems:
             message = " ".join(self._last_message(run_id).split())

@@ -22,7 +22,7 @@ from traps_pipeline.base.files import replacing, write_bytes
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
-from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, Given, reader_of
+from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
@@ -188,7 +188,7 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Whose:
+class AnswerContext:
     """The context that a file of answers by item lacks.
 
     model: of the experiment (None: its only one); run; key: of the held-out set whose opaque names the file has.
@@ -203,7 +203,7 @@ def import_answers(
     workspace: Workspace,
     experiment: Experiment,
     path: Path,
-    whose: Whose | None = None,
+    context: AnswerContext | None = None,
     errors: Literal["drop", "keep"] | None = None,
 ) -> Imported:
     """Import answers into the ledger; `traps run` then builds tables from them.
@@ -222,7 +222,9 @@ def import_answers(
         return _import_batch(workspace, workspace.answers, load_models(), requested, path)
     reader = reader_of(path)
     answers, n_failed = (
-        (checked_answers(path, requested), 0) if reader is None else _by_item(reader(path), requested, whose or Whose())
+        (checked_answers(path, requested), 0)
+        if reader is None
+        else _by_item(reader(path), requested, context or AnswerContext())
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
@@ -343,14 +345,14 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
 
 
 def _by_item(
-    imported: Iterable[Given], requested: Mapping[str, Request], whose: Whose
+    imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
     """Return a harness's answers by key, and the number of its failed calls without an answer elsewhere.
 
-    Epochs of a harness are runs from `whose.run` on. Raises TrapsError naming (up to five) wrong or unwanted answers.
+    Epochs of a harness are runs from `context.run` on. Raises TrapsError naming (up to five) wrong or unwanted answers.
     """
     models = sorted({request.participant for request in requested.values()})
-    model = whose.model or (models[0] if len(models) == 1 else None)
+    model = context.model or (models[0] if len(models) == 1 else None)
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
@@ -358,10 +360,10 @@ def _by_item(
         for key, request in requested.items()
         if (at := request.about)["model"] == model
     }
-    names = {opaque(whose.key, item): item for item, _, _ in keys} if whose.key else {}
+    names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
     answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
     for one in imported:
-        run = whose.run + one.epoch - 1 if one.run is None else one.run
+        run = context.run + one.epoch - 1 if one.run is None else one.run
         key = keys.get((names.get(one.item, one.item), one.regime, run))
         try:
             if key is None:

@@ -28,11 +28,11 @@ OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused"
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
 LOG = ".eval"  # suffix of inspect_ai's own log format
-Reader = Callable[[Path], Iterator["Given"]]
+Reader = Callable[[Path], Iterator["LoggedAnswer"]]
 
 
 @dataclass(frozen=True)
-class Given:
+class LoggedAnswer:
     """An answer to an item from a harness's log.
 
     where: file and line or sample, for messages. item: its id, or its opaque name in a held-out set. answer: fields of
@@ -68,7 +68,7 @@ def reader_of(path: Path) -> Reader | None:
 # --- inspect_ai -------------------------------------------------------------------------------------------------------
 
 
-def _json_log(path: Path) -> Iterator[Given]:
+def _json_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
         if path.stat().st_size > MOST_LOG_BYTES:
             raise TrapsError(f"{path}: is larger than {MOST_LOG_BYTES} bytes; log it without images (--no-log-images)")
@@ -82,7 +82,7 @@ def _json_log(path: Path) -> Iterator[Given]:
         yield _sample(f"{path}: sample {number}", sample)
 
 
-def _eval_log(path: Path) -> Iterator[Given]:
+def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
     """Yield the answers of a log in a zip, which has one JSON file per sample (deflate or zstd)."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
@@ -119,7 +119,7 @@ def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
     return content
 
 
-def _sample(where: str, sample: Any) -> Given:
+def _sample(where: str, sample: Any) -> LoggedAnswer:
     try:
         about, output = sample["metadata"], sample["output"]
         choices, epoch = output.get("choices") or [{}], sample.get("epoch", 1)
@@ -131,7 +131,7 @@ def _sample(where: str, sample: Any) -> Given:
         answer |= {"reasoning": _reasoning(choices[0].get("message")), **_tokens(output.get("usage") or {})}
         if type(epoch) is not int:
             raise TypeError("its epoch is no whole number")
-        return Given(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
+        return LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise TrapsError(f"{where}: is no sample of this benchmark's task ({plain(repr(error))[:200]})") from error
 
@@ -172,7 +172,7 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
 # --- lmms-eval and lines of one's own ---------------------------------------------------------------------------------
 
 
-def _lmms_samples(path: Path) -> Iterator[Given]:
+def _lmms_samples(path: Path) -> Iterator[LoggedAnswer]:
     for number, line in read_lines(path):
         where = f"{path}:{number}"
         try:
@@ -180,12 +180,12 @@ def _lmms_samples(path: Path) -> Iterator[Given]:
             about, texts = row["traps_pecs"], row["filtered_resps"]
             while isinstance(texts, list):
                 (texts,) = texts
-            yield Given(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
+            yield LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
         except (ValueError, KeyError, TypeError) as error:
             raise TrapsError(f"{where}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})") from error
 
 
-def _own_lines(path: Path) -> Iterator[Given]:
+def _own_lines(path: Path) -> Iterator[LoggedAnswer]:
     """Yield lines with item, regime, text, and run if there are several."""
     for number, line in read_lines(path):
         try:
@@ -194,7 +194,7 @@ def _own_lines(path: Path) -> Iterator[Given]:
             if run is not None and type(run) is not int:
                 raise ValueError("run is no whole number")
             answer = _answer(row.pop("outcome", "answer"), row.pop("text", None)) | row
-            yield Given(f"{path}:{number}", str(item), str(regime), run, answer)
+            yield LoggedAnswer(f"{path}:{number}", str(item), str(regime), run, answer)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrapsError(f"{path}:{number}: gives no item, regime and text ({plain(repr(error))[:200]})") from error
 

@@ -22,7 +22,7 @@ _DATA, _BASE64 = "data:", ";base64,"
 
 
 @dataclass(frozen=True)
-class References:
+class MediaReferences:
     """The folder that media are written to, and its future public address."""
 
     folder: Path

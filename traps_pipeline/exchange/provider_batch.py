@@ -22,7 +22,7 @@ from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.checks.loopback import render, replay
 from traps_pipeline.checks.wire_body import Api, WireBody
 from traps_pipeline.exchange.media_references import FOLDER as MEDIA
-from traps_pipeline.exchange.media_references import References
+from traps_pipeline.exchange.media_references import MediaReferences
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Outcome, Request
 
@@ -71,7 +71,7 @@ def export_batches(
         raise TrapsError(f"{folder} holds batches already; give another folder, or delete it")
     folder.mkdir(parents=True, exist_ok=True)
     files, count = list[Path](), 0
-    references = References(out / MEDIA, media_at) if media_at else None
+    references = MediaReferences(out / MEDIA, media_at) if media_at else None
     for name, (entry, requests) in calls.items():
         part = _Part(folder, name)
         for some in _some(requests):

@@ -21,9 +21,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.batch import Batch, claim
 from traps_pipeline.ledger.database import Database, Lock, sentence
 from traps_pipeline.ledger.rows import (
-    ASIDES,
     AVERAGED,
     NOT_WHOLE,
+    SIDE_TEXTS,
     Known,
     Stored,
     Totals,
@@ -90,7 +90,7 @@ class Ledger:
         """
         for row in self._rows(evaluation):
             if _is_whole(row):
-                asides = {name: getattr(row, name) for name in ASIDES}
+                asides = {name: getattr(row, name) for name in SIDE_TEXTS}
                 yield (
                     json.loads(row.content),
                     {name: text.decode() for name, text in asides.items() if text is not None},
@@ -244,7 +244,7 @@ class _Content:
         return cls(row, encoded(row), asides)
 
     def values(self, evaluation: int) -> dict[str, Any]:
-        asides = {name: self.asides.get(name) for name in ASIDES}
+        asides = {name: self.asides.get(name) for name in SIDE_TEXTS}
         digest = digest_of(self.row["key"], self.content, asides["reasoning"], asides["raw"])
         return {"evaluation": evaluation, "key": self.row["key"], "content": self.content, "digest": digest, **asides}
 
@@ -268,7 +268,7 @@ class Writer:
     ) -> None:
         """Add a row, its side texts and its cost; return once no kill of this process can lose them.
 
-        beside: texts by name in ASIDES. paid_by: reservations that the row's cost replaces. Raises TrapsError if
+        beside: texts by name in SIDE_TEXTS. paid_by: reservations that the row's cost replaces. Raises TrapsError if
         nothing was stored, and ValueError for a row that JSON cannot hold.
         """
         content = _Content.of(row, beside)

@@ -21,7 +21,7 @@ from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS, TOTALS
 
 
 @dataclass(frozen=True)
-class Full:
+class CapExhausted:
     """The reason why a call was not reserved.
 
     slot: the participant whose cap is exhausted, None for the study's; taken_usd: spent and reserved under that cap;
@@ -50,7 +50,7 @@ class Money:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | Full]:
+    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | CapExhausted]:
         """Reserve dollars if every relevant cap leaves room; return the reservation's id, or why there is no room.
 
         caps: of each participant that has one, and of the study (None).
@@ -58,17 +58,17 @@ class Money:
         reservation = secrets.token_hex(8)
         slots = [slot for slot in (None, participant) if slot in caps]
 
-        def change(batch: Batch) -> str | Full:
+        def change(batch: Batch) -> str | CapExhausted:
             for slot in slots:
                 committed = sum(sum(_of(its, slot)) for its in (batch.spent, batch.reserved))
                 if caps[slot] - committed < usd - CENT:
-                    return Full(slot, committed, _others(batch))
+                    return CapExhausted(slot, committed, _others(batch))
             batch.reserve(reservation, participant, usd)
             return reservation
 
         return self._database.submit(change)
 
-    def forget(self, pending: Future[str | Full], participant: str, usd: float) -> None:
+    def forget(self, pending: Future[str | CapExhausted], participant: str, usd: float) -> None:
         """Remove an abandoned reservation, if it was made."""
         if not pending.cancelled() and pending.exception() is None and isinstance(pending.result(), str):
             self.settle(str(pending.result()), participant, usd, 0.0)

@@ -14,9 +14,9 @@ from hashlib import blake2b
 from typing import Any
 
 FAILED = ("error", "malformed")  # outcomes that settle no key
-ASIDES = ("reasoning", "raw")  # texts kept beside rows, so that reading answers stays quick
+SIDE_TEXTS = ("reasoning", "raw")  # texts kept beside rows, so that reading answers stays quick
 NOT_WHOLE = "not what was written"
-Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and its side texts by name in ASIDES
+Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and its side texts by name in SIDE_TEXTS
 
 MOST_TOKENS = 10**9
 MOST_USD = 10_000.0  # limit for one call with all its attempts

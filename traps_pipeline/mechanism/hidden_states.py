@@ -70,7 +70,7 @@ class Item:
 
 
 @dataclass(frozen=True)
-class Extracted:
+class ExtractionResult:
     """The result of an extraction. version: digest of the folder's current content, equal for equal items and model."""
 
     folder: Path
@@ -128,7 +128,7 @@ def extract(
     pooling: Pooling = "last",
     shard_size: int = SHARD_SIZE,
     what: str = "items",
-) -> Extracted:
+) -> ExtractionResult:
     """Extract the missing states of the items, one prompt per pass, then write the current row of each item.
 
     Several processes may work at one folder: each takes free chunks of `shard_size` items. If one ends early (Ctrl-C,
@@ -153,7 +153,7 @@ def extract(
         _sweep(folder, {known[key][0] for key in keys})
     _note_devices(folder, sorted({known[key][2] for key in keys}))
     version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
-    return Extracted(folder, len(items), count, version)
+    return ExtractionResult(folder, len(items), count, version)
 
 
 def _tick(what: str, before: int, total: int, done: int) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.money import Full, Money
+from traps_pipeline.ledger.money import CapExhausted, Money
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request
@@ -154,7 +154,7 @@ class Budget:
         settled = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
         await asyncio.wrap_future(settled)
 
-    async def _may_make_room(self, full: Full) -> bool:
+    async def _may_make_room(self, full: CapExhausted) -> bool:
         """Return whether calls in flight, of any process, may cost less than their worst case."""
         if any(full.slot in (None, its.participant) for its in self._in_flight.values()):
             return True

@@ -192,10 +192,10 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 def panel_version(panel: str) -> str:
     """Return the version of everything that decides a panel's votes besides answers: judges, prompts, schemas."""
-    return version_of_seats(load_panel(panel)) if panel else "no panel is named"
+    return version_of_judges(load_panel(panel)) if panel else "no panel is named"
 
 
-def version_of_seats(seats: Iterable[Judge]) -> str:
+def version_of_judges(seats: Iterable[Judge]) -> str:
     """Return the version of these judges, with their prompts and schemas."""
     judges = list[list[Any]]()
     for seat in seats:
@@ -206,12 +206,12 @@ def version_of_seats(seats: Iterable[Judge]) -> str:
 
 def panel_id(panel: str) -> str:
     """Return a panel's id in rows: its name and the version of its judges, with a mark for a single judge."""
-    return id_of_seats(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
+    return id_of_judges(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
 
 
-def id_of_seats(name: str, seats: Sequence[Judge]) -> str:
+def id_of_judges(name: str, seats: Sequence[Judge]) -> str:
     """Return the id of a panel of this name and these judges."""
-    return f"{name}@{version_of_seats(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
+    return f"{name}@{version_of_judges(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
 
 
 def panel_names(panels: str) -> list[str]:

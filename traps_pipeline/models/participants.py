@@ -19,7 +19,7 @@ from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.rows import ASIDES
+from traps_pipeline.ledger.rows import SIDE_TEXTS
 from traps_pipeline.models.budget import Budget, BudgetReached, Reservation, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
 from traps_pipeline.models.request import (
@@ -248,7 +248,7 @@ def ledger_row(
 ) -> tuple[Row, dict[str, str]]:
     """Return the row of an answer, and its side texts: the reasoning trace, a malformed answer."""
     fields = asdict(outcome)
-    beside = {name: text for name in ASIDES if (text := fields.pop(name)) is not None}
+    beside = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
     if fields["first_token"] is None:
         del fields["first_token"]  # few calls have it, so it is left out otherwise
     row = {

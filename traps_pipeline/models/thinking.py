@@ -28,7 +28,7 @@ _TURN = re.compile(r"<\|start\|>assistant|<\|(?:start|end|return)\|>")  # gpt-os
 
 
 @dataclass(frozen=True)
-class Split:
+class ThinkingSplit:
     """A text split into thinking and answer. is_open: whether the text ends inside its thinking."""
 
     thinking: str
@@ -48,14 +48,14 @@ def marks_of(declared: str | Sequence[str]) -> Marks:
     return both[0], both[1]
 
 
-def split_thinking(text: str, marks: Marks | None) -> Split:
+def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
     """Split a text's thinking from its answer; without marks all of it is the answer.
 
     A closing mark without an opening one ends thinking that began with the text: some chat templates open it
     themselves.
     """
     if marks is None:
-        return Split("", text, is_open=False)
+        return ThinkingSplit("", text, is_open=False)
     opens, closes = (re.escape(mark) for mark in marks)
     thinking, answer, is_open = "", "", False
     for piece in re.split(rf"({opens}|{closes})", text, flags=re.IGNORECASE):
@@ -69,7 +69,7 @@ def split_thinking(text: str, marks: Marks | None) -> Split:
             thinking += piece
         else:
             answer += piece
-    return Split(_TURN.sub("", thinking).strip(), _TURN.sub("", answer).strip(), is_open)
+    return ThinkingSplit(_TURN.sub("", thinking).strip(), _TURN.sub("", answer).strip(), is_open)
 
 
 def strip_tokens(text: str) -> str:

@@ -30,7 +30,7 @@ _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 
 @dataclass
-class Ran:
+class RunOutcome:
     """A run's problems, one sentence each, and whether a budget was reached."""
 
     problems: list[str]
@@ -47,7 +47,7 @@ class Runs(ABC):
         """
 
     @abstractmethod
-    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[RunOutcome]:
         """Materialize the stages in these ranges; KeyboardInterrupt propagates."""
 
 
@@ -71,7 +71,7 @@ class RunsHere(Runs):
         """See `Runs`: the fewest ranges that contain exactly these keys."""
         return [*batches(stages[0].scheme if stages else None, keys)]
 
-    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
         for number, one in enumerate(ranges, start=1):
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
@@ -83,7 +83,7 @@ class RunsHere(Runs):
             self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
             yield outcome
 
-    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> Ran:
+    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
         key = one[0] if one[0] == one[1] else None
         try:
             result = self._job.execute_in_process(
@@ -127,11 +127,11 @@ def this_host() -> str:
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 
 
-def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
+def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
     """Return the messages of failed steps."""
     problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
     over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
-    return Ran(problems, over)
+    return RunOutcome(problems, over)
 
 
 def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:

@@ -65,7 +65,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Released:
+class ReleaseSummary:
     """A summary of the written folder: numbers of files, clips and rows by table; the path of held-out answers."""
 
     files: int
@@ -91,7 +91,7 @@ class _Folder:
         self.rows[table.name] = len(rows)
 
 
-def write_release(content: Content, target: Path, options: Options) -> Released:
+def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
     """Write the folder; it may replace only a former release. Raises TrapsError."""
     if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
         raise TrapsError(
@@ -113,7 +113,7 @@ def write_release(content: Content, target: Path, options: Options) -> Released:
         write_bytes(target / name, source.read_bytes())
     _pages(folder, content, options)
     files = write_checksums(target, content.release.canary) + 1
-    return Released(files, len(clips), folder.rows, answers)
+    return ReleaseSummary(files, len(clips), folder.rows, answers)
 
 
 def _clear(target: Path) -> None:

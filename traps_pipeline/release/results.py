@@ -36,18 +36,18 @@ Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Who:
+class Attribution:
     """The evaluating organization, and the developer of all models except reference models."""
 
     organization: str = "unknown"
     developer: str = "unknown"
 
-    def made(self, model: str) -> str:
+    def developer_of(self, model: str) -> str:
         """Return a model's developer."""
         return OURS if is_reference(model) else self.developer
 
 
-def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) -> list[str]:
+def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribution) -> list[str]:
     """Write the overall figures of every model that has them, and all rows as Parquet; return the files.
 
     dataset: the repository of the release, as the hub names it.
@@ -77,7 +77,7 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
         record = _ever_record(str(model), entries, dataset, who, when, release)
         name = uuid.UUID(digest(record)[:32], version=4)  # in the form of the random ids that the collection asks for
-        files.append(f"{EVER}/{release.name}/{who.made(str(model))}/{model}/{name}.json")
+        files.append(f"{EVER}/{release.name}/{who.developer_of(str(model))}/{model}/{name}.json")
         write_text(target / files[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     write_bytes(target / PARQUET, table_bytes(LEADERBOARD, board))
     return [*files, PARQUET]
@@ -94,7 +94,7 @@ def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
 
 
 def _ever_record(
-    model: str, rows: list[dict[str, Any]], dataset: str, who: Who, when: pd.Timestamp, release: Release
+    model: str, rows: list[dict[str, Any]], dataset: str, who: Attribution, when: pd.Timestamp, release: Release
 ) -> dict[str, Any]:
     seconds = str(int(when.timestamp()))
     return {
@@ -111,8 +111,8 @@ def _ever_record(
         "eval_library": {"name": "traps-pipeline", "version": version("traps-pipeline")},
         "model_info": {
             "name": model,
-            "id": f"{who.made(model)}/{model}",
-            "developer": who.made(model),
+            "id": f"{who.developer_of(model)}/{model}",
+            "developer": who.developer_of(model),
             "additional_details": _UNKNOWN,
         },
         "evaluation_results": [one for row in rows for one in _ever_results(row, dataset, release)],

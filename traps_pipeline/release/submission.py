@@ -51,7 +51,7 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class SeatEntry(_Strict):
+class SubmittedJudge(_Strict):
     """A judge in a submission: everything that decides its votes, without address and key."""
 
     id: str = Field(max_length=200)
@@ -74,7 +74,7 @@ class About(_Strict):
     benchmark: str = Field(max_length=200)
     version: str = Field(max_length=200)
     panel: str = Field(max_length=200)
-    judges: tuple[SeatEntry, ...] = Field(min_length=1, max_length=10, strict=False)
+    judges: tuple[SubmittedJudge, ...] = Field(min_length=1, max_length=10, strict=False)
     judged_by_rules: bool
     prompts: dict[str, str]
     versions: dict[str, str]
@@ -117,7 +117,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
     frames["votes.parquet"] = frames["votes.parquet"].loc[lambda votes: votes["panel"] == panel_id(study.panel)]
     content = {file: table_bytes(TABLES[file], frame) for file, frame in frames.items()}
     seats = [
-        SeatEntry.model_validate({name: getattr(seat, name) for name in SeatEntry.model_fields})
+        SubmittedJudge.model_validate({name: getattr(seat, name) for name in SubmittedJudge.model_fields})
         for seat in load_panel(study.panel)
     ]
     try:

@@ -13,7 +13,7 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.models.judges import id_of_seats
+from traps_pipeline.models.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
 from traps_pipeline.release.verification import Verified, verify
@@ -43,7 +43,7 @@ class Accepted:
         """The digest of its items, and its panel: submissions with the same group are ranked together."""
         items = self.submission.table(ITEMS)
         about = self.submission.about
-        return digest(sorted(items["item_hash"]))[:16], id_of_seats(about.panel, about.judges)
+        return digest(sorted(items["item_hash"]))[:16], id_of_judges(about.panel, about.judges)
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Refused:
 
 
 @dataclass(frozen=True)
-class Group:
+class RankedGroup:
     """Entries that are ranked together: LEADERBOARD rows, of models named model@submission if names repeat."""
 
     items: str
@@ -75,7 +75,7 @@ class Group:
 class Board:
     """All submissions of a page."""
 
-    groups: list[Group] = field(default_factory=list)
+    groups: list[RankedGroup] = field(default_factory=list)
     accepted: list[Accepted] = field(default_factory=list)
     refused: list[Refused] = field(default_factory=list)
 
@@ -110,7 +110,7 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
     return board
 
 
-def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
+def _group(key: tuple[str, str], members: Sequence[Accepted]) -> RankedGroup:
     """Return the members' verdicts scored together, so that their differences are paired over the same scenarios."""
     owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
@@ -122,7 +122,7 @@ def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
     verdicts = pd.concat(parts, ignore_index=True)
     versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))
     items = len(members[0].submission.table(ITEMS))
-    return Group(*key, versions, items, score(verdicts).board, submissions)
+    return RankedGroup(*key, versions, items, score(verdicts).board, submissions)
 
 
 def _verdicts(one: Accepted) -> pd.DataFrame:

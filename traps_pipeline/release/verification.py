@@ -25,7 +25,7 @@ from traps_pipeline.judging.rules import RuleJudge
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judged_answers import is_correct
-from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_seats
+from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_judges
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import degenerate
 from traps_pipeline.models.registry import is_reference
@@ -182,7 +182,7 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
 
 def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
     about = submission.about
-    own = id_of_seats(about.panel, about.judges)
+    own = id_of_judges(about.panel, about.judges)
     for panel in sorted({row["panel"] for row in votes} - {own}):
         yield f"panel {panel!r:.100}: these judges and this version's prompts are {own}"
     if RULE in {seat.backend for seat in about.judges} and not about.judged_by_rules:
@@ -270,7 +270,7 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 def _numbers(verified: Verified, submission: Submission) -> None:
     """Compute verdicts, metrics and leaderboard from the votes; record how the submission's numbers differ."""
-    own = id_of_seats(submission.about.panel, submission.about.judges)
+    own = id_of_judges(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables

@@ -18,9 +18,9 @@ from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import (
     COLUMN_IN,
-    Behind,
     NotRun,
     PrintedTable,
+    SourceItems,
     environment,
     figure_bytes,
     table_html,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 EXPLORER = "index.html"  # path beside the report page
 MEDIA = {"svg": "image/svg+xml", "webp": "image/webp", "csv": "text/csv", "tex": "application/x-tex"}
-Address = Callable[[Behind], str]
+Address = Callable[[SourceItems], str]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Sources:
         return PublishedResults()
 
 
-def explorer_address(behind: Behind) -> str:
+def explorer_address(behind: SourceItems) -> str:
     """Return the address of the explorer's view of the answers behind a number."""
     query = {name: value for name, value in vars(behind).items() if value}
     return f"{EXPLORER}#/answers" + (f"?{urlencode(query)}" if query else "")

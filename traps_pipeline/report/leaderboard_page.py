@@ -40,9 +40,9 @@ from traps_pipeline.report.terms import (
 from traps_pipeline.report.writing import (
     NONE,
     NOT_RUN,
-    Behind,
     Column,
     PrintedTable,
+    SourceItems,
     fraction,
     percent,
     table_markdown,
@@ -252,7 +252,7 @@ def _notes_on_arms(beside: Robust) -> list[str]:
     return [*notes, *(f"no conjunction and no robust figure: {why}" for why in refused)]
 
 
-def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
+def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     if row.get(field) == NOT_RUN:
         return None
     return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)

@@ -10,7 +10,7 @@ import pandas as pd
 
 from traps_pipeline.report.cards import Address, Card, tables_html
 from traps_pipeline.report.leaderboard_page import leaderboards, legend, provenance
-from traps_pipeline.report.study_findings import Finding
+from traps_pipeline.report.study_findings import StudyFinding
 from traps_pipeline.report.writing import TEMPLATES, environment
 
 FIRST = "figure-pecs_landscape"  # beside the leaderboard
@@ -22,7 +22,7 @@ def report_html(
     pictures: Sequence[Card] = (),
     tables: Sequence[Card] = (),
     *,
-    findings: Sequence[Finding] = (),
+    findings: Sequence[StudyFinding] = (),
     address: Address | None = None,
     explorer: str = "",
     title: str = "TRAPSBench report",

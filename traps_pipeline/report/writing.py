@@ -47,7 +47,7 @@ DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0
 
 
 @dataclass(frozen=True)
-class Behind:
+class SourceItems:
     """The items behind a number; an empty field means all."""
 
     dataset: str = ""
@@ -60,7 +60,7 @@ class NotRun(Exception):
     """A figure has no data; the message gives the reason, for people."""
 
 
-Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> the items behind that number
+Trace = Callable[[Mapping[str, Any], str], SourceItems | None]  # row and field -> the items behind that number
 
 
 # --- numbers as printed -----------------------------------------------------------------------------------------------
@@ -275,7 +275,7 @@ def table_latex(table: PrintedTable) -> str:
     return str(text)
 
 
-def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = None) -> str:
+def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
     """Return a table in a scrolling box with notes below, escaped. `address`: link numbers to the items behind them."""
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:

@@ -29,7 +29,7 @@ _AGREEING = (AGREES, ROUNDING)
 
 
 @dataclass(frozen=True)
-class Finding:
+class AuditFinding:
     """A published statement, the value recomputed from the published tables, and its line in the paper's source."""
 
     group: str
@@ -43,7 +43,7 @@ class Finding:
 
 def audit() -> pd.DataFrame:
     """Return every finding: columns group, statement, published, recomputed, verdict, reason, line."""
-    groups: Sequence[Callable[[], Iterator[Finding]]] = (
+    groups: Sequence[Callable[[], Iterator[AuditFinding]]] = (
         claims,
         overall_means,
         pecs_factors,
@@ -91,7 +91,7 @@ def counts_text(findings: pd.DataFrame) -> str:
 # --- claims.csv -------------------------------------------------------------------------------------------------------
 
 
-def claims() -> Iterator[Finding]:
+def claims() -> Iterator[AuditFinding]:
     """Yield every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
@@ -101,7 +101,7 @@ def claims() -> Iterator[Finding]:
         if verdict == DIFFERS and recomputed.agrees is None:
             reason = f"{_differences(printed, recomputed.words)}{'; ' + reason if reason else ''}"
         statement, line = f"{claim['id']}: {claim['statement']}", str(claim["line"])
-        yield Finding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
+        yield AuditFinding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
@@ -148,7 +148,7 @@ def _line(table: str) -> str:
 # --- tables against each other ----------------------------------------------------------------------------------------
 
 
-def overall_means() -> Iterator[Finding]:
+def overall_means() -> Iterator[AuditFinding]:
     """Yield the overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
     cells = published_cells()
     ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
@@ -167,13 +167,13 @@ def overall_means() -> Iterator[Finding]:
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
             name = f"overall {share} of {model}, {regime}"
             figures = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
-            yield Finding("overall", name, *figures, verdict, reason, _line("overall"))
+            yield AuditFinding("overall", name, *figures, verdict, reason, _line("overall"))
 
 
 _REPLICATION = models_of(group="replication")
 
 
-def pecs_factors() -> Iterator[Finding]:
+def pecs_factors() -> Iterator[AuditFinding]:
     """Yield PECS of every cell against its printed factors, within averaging and rounding errors.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
@@ -193,7 +193,7 @@ def pecs_factors() -> Iterator[Finding]:
         name = f"PECS of {cell['model']}, {cell['dataset']}, {cell['regime']}"
         figures = f"{shares['pecs']:.3f}", f"{naive:.4f}"
         group = "replication_per_dataset" if cell["model"] in _REPLICATION else "per_dataset"
-        yield Finding("pecs factors", name, *figures, verdict, "" if verdict == AGREES else reason, _line(group))
+        yield AuditFinding("pecs factors", name, *figures, verdict, "" if verdict == AGREES else reason, _line(group))
 
 
 def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
@@ -209,7 +209,7 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
     return low, (shares["acc"] + half) * most + covariance
 
 
-def gaps() -> Iterator[Finding]:
+def gaps() -> Iterator[AuditFinding]:
     """Yield the printed gaps against the printed rates, each of which may have been rounded in its last digit."""
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
@@ -228,10 +228,10 @@ def gaps() -> Iterator[Finding]:
                 "" if agrees else f"{textual:g} / {visual:g} = {ours:.2f}; rounding allows {lowest:.2f}-{highest:.2f}"
             )
             name = f"textual over visual, {taxonomy}, {row['model']}"
-            yield Finding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason, _line("visual_textual"))
+            yield AuditFinding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason, _line("visual_textual"))
 
 
-def probe_means() -> Iterator[Finding]:
+def probe_means() -> Iterator[AuditFinding]:
     """Yield the printed four-path means against the means of the printed pairs, each rounded in its last digit."""
     columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
     for row in published_rows("probe_means"):
@@ -242,10 +242,10 @@ def probe_means() -> Iterator[Finding]:
             verdict: Verdict = AGREES if off <= 0.0005 + _SLACK else ROUNDING if off <= 0.001 + _SLACK else DIFFERS
             name = f"four-path mean AUROC, {items}, {row['model']}, {row['transfer_type']}"
             figures = f"{row[column]:.3f}", f"{mean:.5g}"
-            yield Finding("probe means", name, *figures, verdict, line=_line("probe_means"))
+            yield AuditFinding("probe means", name, *figures, verdict, line=_line("probe_means"))
 
 
-def transfer_types() -> Iterator[Finding]:
+def transfer_types() -> Iterator[AuditFinding]:
     """Yield printed transfer types against their definitions."""
     for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
@@ -255,10 +255,10 @@ def transfer_types() -> Iterator[Finding]:
             )
             reason = "" if ours == printed else f"{row['source']} and {row['target']} share the taxonomy"
             verdict: Verdict = AGREES if ours == printed else DIFFERS
-            yield Finding("transfer types", where, printed, ours, verdict, reason, _line(table))
+            yield AuditFinding("transfer types", where, printed, ours, verdict, reason, _line(table))
 
 
-def steering_means() -> Iterator[Finding]:
+def steering_means() -> Iterator[AuditFinding]:
     """Yield the regime table of gemma-4-e4b against the means of its dose table.
 
     The paper calls the latter a verification run with a smaller budget and lower rates. (For qwen3-vl-8b the claims
@@ -277,10 +277,10 @@ def steering_means() -> Iterator[Finding]:
             )
             reason = "" if same else f"lies {abs(ours - theirs):.3g} points {'below' if below else 'above'}, {where}"
             statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
-            yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
+            yield AuditFinding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
 
 
-def steering_families() -> Iterator[Finding]:
+def steering_families() -> Iterator[AuditFinding]:
     """Yield the regime table's figures over all paths against the means of its two source families of four paths.
 
     The table does not name the prompt of the families' directions; the guided ones are assumed.
@@ -297,10 +297,12 @@ def steering_families() -> Iterator[Finding]:
             sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
-            yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes"))
+            yield AuditFinding(
+                "steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
+            )
 
 
-def validation_scores() -> Iterator[Finding]:
+def validation_scores() -> Iterator[AuditFinding]:
     """Yield F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last
     digit."""
     for row in published("judge_validation").to_dict("records"):
@@ -312,14 +314,14 @@ def validation_scores() -> Iterator[Finding]:
         verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
         reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
         figures = f"{printed:.2f}", f"{ours:.3f}"
-        yield Finding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
+        yield AuditFinding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
 
 
 def _f1(precision: float, recall: float) -> float:
     return 2 * precision * recall / (precision + recall)
 
 
-def composition_sums() -> Iterator[Finding]:
+def composition_sums() -> Iterator[AuditFinding]:
     """Yield category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
     counts: dict[str, int] = {}
     for row in published_rows("composition"):
@@ -328,14 +330,14 @@ def composition_sums() -> Iterator[Finding]:
         printed, ours = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
         verdict: Verdict = AGREES if ours == printed else DIFFERS
         shown = str(printed), str(ours)
-        yield Finding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
+        yield AuditFinding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
 
 
 # --- the text against itself ------------------------------------------------------------------------------------------
 
 
-def contradictions() -> Iterator[Finding]:
+def contradictions() -> Iterator[AuditFinding]:
     """Yield statements that contradict another place of the paper's text, where no arithmetic decides."""
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
-        yield Finding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)
+        yield AuditFinding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

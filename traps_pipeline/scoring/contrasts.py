@@ -29,7 +29,7 @@ from traps_pipeline.scoring.bootstrap import (
     limits_of,
     resample,
 )
-from traps_pipeline.scoring.epochs import Origin, answered, refusal
+from traps_pipeline.scoring.epochs import Origin, answered_items, refusal
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, REGIME_TESTS
 from traps_pipeline.scoring.standings import means_over_runs, standings
@@ -50,7 +50,7 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
     run of all four.
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
-    items_of, sizes = answered(verdicts), _scenarios(verdicts)
+    items_of, sizes = answered_items(verdicts), _scenarios(verdicts)
     means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
     rows = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
@@ -84,7 +84,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
         raise TrapsError("the two studies share no whole pair of the same model, regime and run")
     boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
     board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
-    asked, drawn = [answered(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
+    asked, drawn = [answered_items(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
     draws = [dict(zip(resampled.entries, resampled.values, strict=True)) for resampled in drawn]
     sizes = _scenarios(sides[1])
     rows = []

@@ -46,7 +46,7 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
     )
 
 
-def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
+def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
     """Return the items that each (model, regime, dataset) answered over its runs, with their origin.
 
     `overall` covers the runs with all four datasets, and is left out if there is none.

@@ -34,7 +34,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Asked:
+class GradedItem:
     """A graded item. posterior: the probability of each possible answer.
 
     commonest: the sub-scenario's commonest answer.
@@ -101,7 +101,7 @@ def graded(
     verdicts: pd.DataFrame,
     votes: pd.DataFrame,
     responses: pd.DataFrame,
-    questions: Mapping[str, Asked],
+    questions: Mapping[str, GradedItem],
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> pd.DataFrame:
@@ -137,7 +137,7 @@ def _name(scope: int) -> str:
     return f"{SCOPES[scope]:g} to {[*SCOPES, 1.0][scope + 1]:g}"
 
 
-def _labels(votes: pd.DataFrame, questions: Mapping[str, Asked]) -> dict[tuple[Any, ...], str]:
+def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tuple[Any, ...], str]:
     """Return the answer of each response by more than half of its judges, "" for an answer that the item does not
     offer.
 
@@ -156,14 +156,14 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, Asked]) -> dict[tuple[A
     return chosen
 
 
-def _of_verdict(item: Asked, abstained: object, label: str | None) -> dict[str, float]:
+def _of_verdict(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
     """Return the figures of a panel's decision; empty if it is undecided."""
     if pd.isna(cast(Any, abstained)) or (not abstained and label is None):
         return {}
     return decided(item, None if abstained else label)
 
 
-def _of_probabilities(item: Asked, stated: Mapping[str, float] | None) -> dict[str, float]:
+def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
     """Return the figures of stated probabilities; empty if there are none.
 
     The policy that acts on them gives the most probable answer, if its probability is at least ANSWER_FROM.
@@ -175,7 +175,7 @@ def _of_probabilities(item: Asked, stated: Mapping[str, float] | None) -> dict[s
     return acts | {"brier": brier(item.posterior, stated), "stated": stated[_commonest(item.posterior)]}
 
 
-def decided(item: Asked, label: str | None) -> dict[str, float]:
+def decided(item: GradedItem, label: str | None) -> dict[str, float]:
     """Return the figures of one answer, or of an abstention (None): its expected points and its regret.
 
     The regret is the loss against an ideal observer, with its reasons.

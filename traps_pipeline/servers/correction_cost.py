@@ -22,7 +22,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 @dataclass
-class Touched:
+class CorrectionEffect:
     """The effect of corrections.
 
     Items by id, the maximum number of answers and votes to ask again (the ledger may know some), dollars of calls over
@@ -39,10 +39,10 @@ class Touched:
     added: list[str] = field(default_factory=list)
     question: str = ""
 
-    def plus(self, other: Touched) -> Touched:
+    def plus(self, other: CorrectionEffect) -> CorrectionEffect:
         """Return the sum of both."""
         known = self.dollars is not None and other.dollars is not None
-        return Touched(
+        return CorrectionEffect(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
             (self.dollars or 0) + (other.dollars or 0) if known else None,
             self.rendered + other.rendered, self.gone + other.gone, self.added + other.added,
@@ -56,7 +56,7 @@ class Touched:
         return cost_text + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
 
 
-def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
+def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> CorrectionEffect:
     """Return the effect of a correction on a SCENE_SPECS row. Raises TrapsError for refused parameters."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
@@ -68,7 +68,7 @@ def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correctio
     ill_posed = changes.get("ill_posed_question", spec["ill_posed_question"]) != spec["ill_posed_question"]
     judged_again = changes.get("answer", spec["ground_truth"]) != spec["ground_truth"] or "labels" in changes
     seats = len(load_panel(workspace.study.panel))
-    cost = Touched(question=question, rendered=[spec["scenario_id"]] if renders else [])
+    cost = CorrectionEffect(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _asked(workspace, spec["taxonomy"]):
         for side in SIDES:
             of_ill_posed = is_ill_posed(dataset) and side == "void"

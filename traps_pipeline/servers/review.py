@@ -24,7 +24,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
 from traps_pipeline.report.explorer.scenario_words import answer_of_control, certificate_phrases, intervention
-from traps_pipeline.servers.correction_cost import Touched, touched
+from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
 from traps_pipeline.servers.duplicates import Comparison
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
 from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, page, script, study_file
@@ -155,7 +155,7 @@ class Review:
         """Return the words after the changes, and the cost of asking again. Raises NotThere and Refused."""
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
-        cost = touched(self.workspace, spec, correction)
+        cost = correction_effect(self.workspace, spec, correction)
         return {"question": cost.question, "cost": cost.sentence()}
 
     def _correction(self, scenario_id: str, action: str, changes: Mapping[str, Any], why: str) -> Correction:
@@ -168,10 +168,10 @@ class Review:
         except ValidationError as error:
             raise Refused(f"{scenario_id}: {explain(error)}") from error
 
-    def summary(self) -> Touched:
+    def summary(self) -> CorrectionEffect:
         """Return the effect of the decisions that the study's tables do not contain yet."""
         scenarios = load_scenarios(self.workspace.study)
-        total = Touched(added=sorted({*scenarios} - {*self.specs}))
+        total = CorrectionEffect(added=sorted({*scenarios} - {*self.specs}))
         for scenario_id, spec in self.specs.items():
             scenario = scenarios.get(scenario_id)
             if scenario is None:
@@ -179,7 +179,7 @@ class Review:
             elif scenario.words or scenario.params is not None:
                 changes = dict(scenario.words) | ({"params": dict(scenario.params)} if scenario.params else {})
                 correction = self._correction(scenario_id, "correct", changes, "summary")
-                total = total.plus(touched(self.workspace, spec, correction))
+                total = total.plus(correction_effect(self.workspace, spec, correction))
         return total
 
     # --- pages --------------------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ class Review:
         """Return the page at the end of a queue: the decisions' effect, and the commands that follow."""
         return page(
             "review_done.html.j2",
-            touched=self.summary(),
+            correction_effect=self.summary(),
             queue=name,
             comparing=self.comparison.progress if name == "alike" else "",
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},

@@ -29,13 +29,13 @@ from traps_pipeline.models.local.checkpoint import (
     weight_bytes,
 )
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.model import Generated, LocalModel, States
+from traps_pipeline.models.local.model import GeneratedAnswer, LocalModel, States
 from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.settings import SPREAD, LocalParams
 from traps_pipeline.models.registry import ModelEntry
 
-__all__ = ["Generated", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
+__all__ = ["GeneratedAnswer", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
 
 NF4_CPU_BLOCK = 64
 WEIGHTS_SHARE = 0.7  # share of free memory for weights before other models are unloaded; the rest is for batches

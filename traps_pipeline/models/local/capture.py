@@ -25,7 +25,7 @@ ONE_TOKEN: tuple[Pooling, ...] = ("last", "answer")
 
 
 @dataclass
-class Captured:
+class CapturedStates:
     """States of one forward pass, on the model's device. raw: embeddings and block outputs in order, each (d,)."""
 
     raw: list[Tensor] = field(default_factory=list)
@@ -53,9 +53,9 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 @contextmanager
 def capturing(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
-) -> Iterator[Captured]:
+) -> Iterator[CapturedStates]:
     """Keep the pooled states of forward passes in the block; the hooks are always removed afterwards."""
-    captured = Captured()
+    captured = CapturedStates()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         captured.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class Decodes(Protocol):
+class DecodingModel(Protocol):
     """The parts of a `LocalModel` that decoding needs."""
 
     network: Any
@@ -37,13 +37,13 @@ class Steers(Protocol):
         ...
 
 
-def steered(steering: Steers | None, model: Decodes) -> AbstractContextManager[None]:
+def steered(steering: Steers | None, model: DecodingModel) -> AbstractContextManager[None]:
     """Return the steering's context, or one that does nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 
 def decode(
-    model: Decodes,
+    model: DecodingModel,
     prompts: Sequence[Prompt],
     max_new_tokens: int,
     sampling: Sampling | None,

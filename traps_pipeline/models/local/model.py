@@ -31,7 +31,7 @@ MEMORY_SHARE = 0.7  # share of free memory for a batch, by estimate
 
 
 @dataclass(frozen=True)
-class Generated:
+class GeneratedAnswer:
     """An answer. finish_reason: stop, or length if `max_new_tokens` cut it off.
 
     first_token: log-probabilities of its likeliest first tokens.
@@ -224,14 +224,14 @@ class LocalModel:
         *,
         use_cache: bool = True,
         stopped: Callable[[], bool] = lambda: False,
-    ) -> list[Generated]:
+    ) -> list[GeneratedAnswer]:
         """Return an answer to each prompt, in order; greedy unless sampling is given.
 
         Batches are sized to memory, and halved after an out-of-memory error; answers depend on them only through
         rounding in 16 bits. sampling, steering: one row per prompt. stopped: called at every token, ends generation
         early. Raises TrapsError if a single prompt does not fit.
         """
-        answers: dict[int, Generated] = {}
+        answers: dict[int, GeneratedAnswer] = {}
         each = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
         for group in batches(prompts, each, MEMORY_SHARE * free_bytes(self.device)):
             pending = [group]
@@ -254,7 +254,7 @@ class LocalModel:
         steering: Steers | None,
         use_cache: bool,
         stopped: Callable[[], bool],
-    ) -> list[Generated] | None:
+    ) -> list[GeneratedAnswer] | None:
         """Return the answers of a batch; None if it must be halved."""
         import torch
 
@@ -286,11 +286,11 @@ class LocalModel:
         steering: Steers | None,
         use_cache: bool,
         stopped: Callable[[], bool],
-    ) -> list[Generated]:
+    ) -> list[GeneratedAnswer]:
         rows, first = decode(self, prompts, max_new_tokens, sampling, steering, use_cache, stopped)
         return [self._answer(*one) for one in zip(prompts, rows, first, strict=True)]
 
-    def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> Generated:
+    def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> GeneratedAnswer:
         eos = self.network.generation_config.eos_token_id
         ends = {eos} if isinstance(eos, int) else {*eos}
         ended = next((i for i, token in enumerate(tokens) if token in ends), None)
@@ -302,7 +302,7 @@ class LocalModel:
                 name = self.processor.tokenizer.decode([token])
                 named[name] = float(np.logaddexp(named.get(name, -np.inf), logprob))
         finish = "length" if ended is None else "stop"
-        return Generated(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
+        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs of a prompt or a batch on the model's device, pictures in its precision."""

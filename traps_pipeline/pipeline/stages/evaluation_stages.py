@@ -59,10 +59,10 @@ def _with_items(
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
     """Return metadata about a cell's items: a table of those without an answer, and the explorer's view of all."""
     from traps_pipeline.report.cards import explorer_address
-    from traps_pipeline.report.writing import Behind
+    from traps_pipeline.report.writing import SourceItems
 
     e = cell.evaluation
-    page, _, view = explorer_address(Behind(cell.dataset, e.model, e.regime)).partition("#")
+    page, _, view = explorer_address(SourceItems(cell.dataset, e.model, e.regime)).partition("#")
     columns = ("item_id", "side", "outcome", "error", "attempts")
     without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
     records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]

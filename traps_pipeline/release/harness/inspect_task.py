@@ -12,7 +12,7 @@ from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
 from traps_pipeline.release.harness.harness_items import about, items, media_of, prompt
-from traps_pipeline.release.harness.scoring import Judged, figures, judge
+from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
 
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
 
@@ -62,7 +62,7 @@ def traps_figures() -> Any:
     """Return the metric: PECS and its factors, overall and by dataset."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        results = figures(Judged.of(one.score.metadata) for one in scores)
+        results = figures(PanelDecision.of(one.score.metadata) for one in scores)
         return {name: value for name, value in results.items() if value is not None}
 
     return compute
@@ -76,6 +76,6 @@ def panel(regime: str) -> Any:
     async def score(state: Any, target: Any) -> Any:
         outcome = _OUTCOMES.get(state.output.stop_reason, "answer")
         judged = judge(known[str(state.sample_id)], outcome, state.output.completion, regime)
-        return Score(value=float(judged.right), answer=state.output.completion, metadata={**vars(judged)})
+        return Score(value=float(judged.is_right), answer=state.output.completion, metadata={**vars(judged)})
 
     return score

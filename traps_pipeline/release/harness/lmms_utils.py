@@ -12,7 +12,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
 
 from traps_pipeline.release.harness.harness_items import media_of, prompt
-from traps_pipeline.release.harness.scoring import Judged, figures, judge
+from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
 
 
 def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
@@ -53,7 +53,7 @@ def _results(doc: dict[str, Any], results: list[str], *, regime: str) -> dict[st
 
 
 def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
-    return figures(Judged.of(row) for row in rows).get(name)
+    return figures(PanelDecision.of(row) for row in rows).get(name)
 
 
 NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")

@@ -22,7 +22,7 @@ RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
 
 
 @dataclass(frozen=True)
-class Judged:
+class PanelDecision:
     """The panel's decision about an answer.
 
     outcome: the kind of text, UNREAD if the rules cannot read it; abstained, correct: None if undecided; correct is
@@ -37,17 +37,17 @@ class Judged:
     correct: bool | None = None
 
     @property
-    def right(self) -> bool:
+    def is_right(self) -> bool:
         """Whether a control was answered correctly, or a void was abstained on."""
         return bool(self.correct if self.side == "control" else self.abstained)
 
     @staticmethod
-    def of(record: Mapping[str, Any]) -> Judged:
+    def of(record: Mapping[str, Any]) -> PanelDecision:
         """Return the decision from its fields (the inverse of `vars`)."""
-        return Judged(**{name: record[name] for name in Judged.__dataclass_fields__})
+        return PanelDecision(**{name: record[name] for name in PanelDecision.__dataclass_fields__})
 
 
-def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> Judged:
+def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> PanelDecision:
     """Return the panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
 
     All three judges of the panel `rules` read by the same rules, so one reading is their majority.
@@ -56,19 +56,19 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     read = read_answer({**row, "text": text}, None, regime)
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
     if read.outcome not in JUDGED or read.text is None:
-        return Judged(**names, outcome=read.outcome)
+        return PanelDecision(**names, outcome=read.outcome)
     statement = read_statement(read.text, item["question"])
     if statement is None:
-        return Judged(**names, outcome=UNREAD)
+        return PanelDecision(**names, outcome=UNREAD)
     abstained = statement.value is None
     if item["side"] != "control":
-        return Judged(**names, outcome=read.outcome, abstained=abstained)
+        return PanelDecision(**names, outcome=read.outcome, abstained=abstained)
     labels, aliases = list(item["labels"]), json.loads(item["aliases"])
     correct = is_correct(statement.value, item["ground_truth"], item["answer_type"], labels, aliases)
-    return Judged(**names, outcome=read.outcome, abstained=abstained, correct=correct)
+    return PanelDecision(**names, outcome=read.outcome, abstained=abstained, correct=correct)
 
 
-def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
+def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     """Return Acc, AbsRec, FalseAbs, J and PECS of one run.
 
     Keys: `DATASET_FIGURE` for each dataset, and FIGURE overall, the equal-weight mean over the four datasets, None
@@ -89,7 +89,7 @@ def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
     return results | {"missing": float(len(undecided)), "unread": float(sum(row.outcome == UNREAD for row in rows))}
 
 
-def _of_dataset(rows: list[Judged]) -> dict[str, float | None]:
+def _of_dataset(rows: list[PanelDecision]) -> dict[str, float | None]:
     acc = _share([row.correct for row in rows if row.side == "control"])
     false_abs = _share([row.abstained for row in rows if row.side == "control"])
     abs_rec = _share([row.abstained for row in rows if row.side == "void"])

@@ -35,7 +35,7 @@ from traps_pipeline.report.tables.table_columns import (
     together,
 )
 from traps_pipeline.report.terms import SIDE_OF
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 
@@ -78,12 +78,12 @@ def visual_textual(results: Results) -> list[PrintedTable]:
     ]
 
 
-def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
+def _rate_trace(row: Mapping[str, Any], field: str) -> SourceItems:
     if field in COUNTED:
-        return Behind("", row["model"], "standard")
+        return SourceItems("", row["model"], "standard")
     taxonomy, _, kind = field.rpartition("_")
     dataset = {"visual": taxonomy, "textual": f"{taxonomy}_ill_posed"}.get(kind, "") if taxonomy != "pooled" else ""
-    return Behind(dataset, row["model"], "standard", "void")
+    return SourceItems(dataset, row["model"], "standard", "void")
 
 
 def uplift(results: Results) -> list[PrintedTable]:
@@ -121,9 +121,9 @@ def uplift(results: Results) -> list[PrintedTable]:
     return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
 
 
-def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
+def _regime_trace(row: Mapping[str, Any], field: str) -> SourceItems:
     regime, _, figure = field.partition("_")
-    return Behind("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
+    return SourceItems("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
 
 
 def naive(results: Results) -> list[PrintedTable]:
@@ -197,7 +197,7 @@ def reasoning(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
     notes += [*marks(table), *refused]
-    trace: Trace = lambda row, field: Behind(  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
     why = "no reasoning pair has both members evaluated on one dataset"
@@ -226,7 +226,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
     if TOO_FEW in set(rows["separable"]):
         notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
     notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
-    trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
     return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
 
@@ -240,7 +240,7 @@ def regime_tests(results: Results) -> list[PrintedTable]:
         Column("only_left", "Yes, left alone", "count"), Column("only_right", "Yes, right alone", "count"),
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("refused", "Refused"),
     ]  # fmt: skip
-    trace: Trace = lambda row, field: Behind(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
     why = "no model has two regimes" if results.is_study else results.why("regime_tests")
     return [PrintedTable("regime_tests", "McNemar’s test of regimes", rows, columns, why=why, trace=trace)]
 
@@ -263,7 +263,7 @@ def spreads(results: Results) -> list[PrintedTable]:
     notes = ["quartiles over cells of the population standard deviation of PECS over runs; cells of one run left out"]
     why = "no cell has more than one run" if len(cells) else results.why("cells")
     rows = frame(rows, ["family"])
-    trace: Trace = lambda row, field: Behind()  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems()  # noqa: E731
     return [PrintedTable("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], why, trace)]
 
 
@@ -287,7 +287,7 @@ def degenerate(results: Results) -> list[PrintedTable]:
         notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
         notes += marks(rows)
     trace: Trace = lambda row, field: (  # noqa: E731
-        Behind("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
+        SourceItems("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
     )
     return [
         PrintedTable(

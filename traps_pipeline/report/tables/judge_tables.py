@@ -18,7 +18,7 @@ from traps_pipeline.report.tables.table_columns import (
     ordered,
     titled,
 )
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,8 +42,8 @@ def agreement(results: Results) -> list[PrintedTable]:
     return [PrintedTable("judge_agreement", "Agreement of the judges", rows, columns, notes, why, _task_trace)]
 
 
-def _task_trace(row: Mapping[str, Any], field: str) -> Behind:
-    return Behind(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
+def _task_trace(row: Mapping[str, Any], field: str) -> SourceItems:
+    return SourceItems(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
 
 
 def _undefined(rows: pd.DataFrame) -> list[str]:
@@ -96,7 +96,7 @@ def validation(results: Results) -> list[PrintedTable]:
             columns,
             notes,
             why,
-            lambda row, field: Behind("", "", "standard", "void"),
+            lambda row, field: SourceItems("", "", "standard", "void"),
             dash="undefined",
         )
     ]
@@ -114,5 +114,5 @@ def confabulation(results: Results) -> list[PrintedTable]:
     if results.is_study:
         columns += [Column("n_sampled", "Sampled", "count"), Column("evidence", "Evidence"), Column("judge", "Judge")]
     why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
-    trace: Trace = lambda row, field: Behind("", row["model"], "standard", "void")  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems("", row["model"], "standard", "void")  # noqa: E731
     return [PrintedTable("confabulation", "Confabulation: prevalence by model", rows, columns, notes, why, trace)]

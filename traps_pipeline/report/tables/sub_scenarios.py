@@ -9,7 +9,7 @@ from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import DATASET, MISSING, PECS, SHARES, N, epochs, marked, marks, titled
 from traps_pipeline.report.terms import SIDE_OF
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
@@ -80,12 +80,12 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
 
 
 def _sub_trace(taxonomy: str) -> Trace:
-    def trace(row: Mapping[str, Any], field: str) -> Behind:
+    def trace(row: Mapping[str, Any], field: str) -> SourceItems:
         if field in ("n_pairs", "n_models", "n", "n_missing"):
-            return Behind(taxonomy)
+            return SourceItems(taxonomy)
         regime = "guided" if field.startswith("guided_") else "standard"
         ill_posed = field == "abs_rec_ill_posed"
         dataset = str(row.get("dataset") or taxonomy)
-        return Behind(f"{taxonomy}_ill_posed" if ill_posed else dataset, "", regime, SIDE_OF.get(field, ""))
+        return SourceItems(f"{taxonomy}_ill_posed" if ill_posed else dataset, "", regime, SIDE_OF.get(field, ""))
 
     return trace

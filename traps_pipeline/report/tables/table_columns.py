@@ -14,7 +14,7 @@ from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
-from traps_pipeline.report.writing import NONE, Behind, Column, PrintedTable, fraction
+from traps_pipeline.report.writing import NONE, Column, PrintedTable, SourceItems, fraction
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,13 +38,13 @@ COUNTS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
-def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
+def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     """Return the items behind a number, by the row's model and regime, and by its dataset if it has one."""
     if field.startswith("published"):
         return None
     dataset = row.get("dataset")
     side = SIDE_OF.get(field, "")
-    return Behind(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
+    return SourceItems(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
 
 
 def marked(rows: pd.DataFrame) -> pd.DataFrame:
