@@ -23,15 +23,15 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.mechanism.deciding import Gate, Threshold, fitted_gate
 from traps_pipeline.mechanism.hook import Site, changing
+from traps_pipeline.mechanism.live_gate import Gate, Threshold, fitted_gate
 from traps_pipeline.mechanism.other_probes import erased as erased
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stages import saved_directions
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.regimes import REGIMES

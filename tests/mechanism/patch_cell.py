@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.mechanism.study import register
-from traps_pipeline.mechanism import patched
+from traps_pipeline.mechanism import patching_stage
 from traps_pipeline.mechanism.patching_effects import Recorded, record
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Extraction
@@ -33,8 +33,8 @@ def main(place: str, described: str) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         register(patch, entry)
-        patch.setattr(patched, "record", counting)
-        rows = patched.patching_rows(workspace, entry, Extraction("tiny", "standard"))
+        patch.setattr(patching_stage, "record", counting)
+        rows = patching_stage.patching_rows(workspace, entry, Extraction("tiny", "standard"))
     print(json.dumps({"passes": passes, "rows": [asdict(row) for row in rows]}), flush=True)
 
 

@@ -21,14 +21,14 @@ from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import RAW
-from traps_pipeline.mechanism.deciding import ABSTENTION
 from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.live_gate import ABSTENTION
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.other_probes import Eraser
 from traps_pipeline.mechanism.probes import scenario_folds
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry

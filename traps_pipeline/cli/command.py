@@ -245,11 +245,11 @@ def open_workspace(arguments: argparse.Namespace) -> Workspace:
 
 def entered(workspace: Workspace) -> Workspace:
     """Return the workspace after setting it in the environment, for partition keys here and in child processes."""
-    from traps_pipeline.models.own import forget
+    from traps_pipeline.models.user_registry import clear_caches
     from traps_pipeline.storage.workspace import VARIABLE
 
     os.environ[VARIABLE] = str(workspace.place)
-    forget()  # the workspace may define models
+    clear_caches()  # the workspace may define models
     os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
     return workspace
 

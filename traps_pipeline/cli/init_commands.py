@@ -42,7 +42,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     if the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.benchmark.corrections import load_scenarios
-    from traps_pipeline.models.own import keep
+    from traps_pipeline.models.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
     place, by_rules = place_of(arguments), arguments.judged_by_rules
@@ -67,7 +67,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     if experiments != workspace.study.experiments:
         workspace = workspace.allow(experiments=experiments)
     entered(workspace)
-    keep(workspace)
+    save_entries(workspace)
     if not (workspace.dagster_home / "dagster.yaml").exists():
         from traps_pipeline.pipeline.run import dagster_history
 

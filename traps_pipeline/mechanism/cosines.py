@@ -18,7 +18,7 @@ from traps_pipeline.mechanism.directions import cosine_matrix
 from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, CosineRow
 from traps_pipeline.mechanism.nulls import nulled
 from traps_pipeline.mechanism.stages import direction_pairs, saved_directions
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import FAMILIES
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import taxonomy_of

@@ -33,7 +33,7 @@ from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.mechanism.nulls import nulled
 from traps_pipeline.mechanism.probes import swapped_labels
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation

@@ -32,7 +32,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
 from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.probing_versions import shown_inside, states_folder
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model

@@ -1,7 +1,7 @@
 """The backend of steered requests: a local model that answers with a direction added to one block.
 
 Requests of one layer are generated together; answers that another process of the machine has generated are reused
-(`made_answers`).
+(`shared_answers`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.mechanism.made_answers import MadeAnswers
+from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.models.local.backend import LocalBackend, outcome
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Outcome, Request
@@ -28,7 +28,7 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 class SteeredBackend(LocalBackend):
     """A local model that answers with a direction added to one block; each row has its own direction and alpha."""
 
-    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: MadeAnswers) -> None:
+    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
         super().__init__(entry)
         self._vectors, self._made = vectors, shared
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)

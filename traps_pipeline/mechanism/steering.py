@@ -23,9 +23,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
-from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.mechanism_rows import STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.probing_versions import loaded_params
+from traps_pipeline.mechanism.shared_answers import SharedAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
@@ -273,7 +273,7 @@ def collect_steered(
     """Generate the missing answers; yield the STEERING rows of each finished cell.
 
     directions: by VQA prompt, then by source. Several processes may run it at once: one writes the answers of an
-    evaluation, and the others generate answers meanwhile (`made_answers`).
+    evaluation, and the others generate answers meanwhile (`shared_answers`).
     """
     vectors = {
         vector_digest(vector): vector
@@ -284,7 +284,7 @@ def collect_steered(
         for vector in draw
     }
 
-    store = MadeAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
+    store = SharedAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
         questions = wanted_steered(workspace, entry, cell, directions[cell.directions])
@@ -310,7 +310,7 @@ def _make_meanwhile(
     workspace: Workspace,
     cell: SteeringCell,
     questions: Sequence[SteeredQuestion],
-    shared: MadeAnswers,
+    shared: SharedAnswers,
     backend: SteeredBackend,
 ) -> None:
     """Generate answers of a cell while another process writes those of its evaluation."""

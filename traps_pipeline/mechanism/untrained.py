@@ -12,7 +12,7 @@ import pandas as pd
 
 from traps_pipeline.mechanism.hidden_states import item_states
 from traps_pipeline.mechanism.stages import probed_item
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import LocalModel

@@ -18,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import read_mapping
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import (
     JUDGE_PROTOCOL,
@@ -125,7 +125,7 @@ class JudgeEntry(Entry):
         return JUDGE_PROTOCOL
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Return judges by id. Raises TrapsError naming judge and field."""
@@ -139,7 +139,7 @@ def thinking_of(judge: str) -> Marks | None:
     return entry.thinking if entry else None
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """Return the judges of a panel: three, or one. Raises TrapsError naming the file and the problem."""
@@ -163,7 +163,7 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
-    return {**panels, **own.together().panels} if path == JUDGES_FILE else panels
+    return {**panels, **user_registry.together().panels} if path == JUDGES_FILE else panels
 
 
 def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:

@@ -22,7 +22,7 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
 from traps_pipeline.models.schemas import answer_object
 from traps_pipeline.models.thinking import Marks, marks_of
@@ -283,8 +283,8 @@ def _add(
     entries: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
 ) -> None:
     name = raw.get("id", "?") if isinstance(raw, dict) else "?"
-    short = [field for field in own.SHORT if isinstance(raw, dict) and field in raw]
-    if short:  # `own` completes an experiment's short entries before they come here
+    short = [field for field in user_registry.SHORT if isinstance(raw, dict) and field in raw]
+    if short:  # `user_registry` completes an experiment's short entries before they come here
         raise TrapsError(
             f"{path}: {what} ({name}): {', '.join(short)}: an entry with an address of its own stands in an "
             "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
@@ -295,15 +295,15 @@ def _add(
     entries[entry.id] = entry
 
 
-def with_own(entries: dict[str, _Entry], key: own.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
+def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
     """Return a registry's entries, followed by those that the experiment and the workspace add."""
     context = {"accounts": load_accounts()}
-    for path, raw in own.entries(key):
+    for path, raw in user_registry.entries(key):
         _add(entries, kind, raw, path, f"own {key.rstrip('s')}", context)
     return entries
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     """Return models by id, in file order. Raises TrapsError naming entry and field."""
@@ -311,7 +311,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     return with_own(models, "models", ModelEntry) if path == MODELS_FILE else models
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
@@ -320,7 +320,7 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     if not isinstance(accounts, dict):
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
     if path == MODELS_FILE:
-        accounts = {**accounts, **own.accounts()}
+        accounts = {**accounts, **user_registry.accounts()}
     return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
 
 
@@ -383,7 +383,7 @@ def is_reference(model_id: str) -> bool:
     return name in known and known[name].backend in ("reference", "observer", "rule")
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def local_models() -> tuple[str, ...]:
     """Return models whose hidden states can be read, in file order."""

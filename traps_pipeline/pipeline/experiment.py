@@ -13,8 +13,8 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.models.judges import require_panel
-from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
+from traps_pipeline.models.user_registry import UserRegistry, add_entries
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SCHEMAS
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
@@ -46,7 +46,7 @@ class Experiment(BaseModel):
     allow_unknown_prices: bool | None = None
     mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
     canary: bool = Field(default=False, description="ask twenty fixed items again in each epoch")
-    own: Own = Field(default=Own(), description="models, judges and panels that the file itself describes")
+    own: UserRegistry = Field(default=UserRegistry(), description="models, judges and panels of this file")
 
     @model_validator(mode="before")
     @classmethod
@@ -180,7 +180,7 @@ def load_experiment(name: str) -> Experiment:
             f"of a YAML file{did_you_mean(name, known)}"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
-    use(experiment.own, path)
+    add_entries(experiment.own, path)
     with within(path):
         for model in experiment.models:
             get_model(model)

@@ -19,7 +19,7 @@ from traps_pipeline.release.submission import Submission, read_submission, table
 from traps_pipeline.release.verification import Verified, verify
 from traps_pipeline.report.leaderboard_page import leaderboards, legend
 from traps_pipeline.report.writing import environment, table_html
-from traps_pipeline.scoring.scored import score
+from traps_pipeline.scoring.scores import score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 
 PAGE, TABLE = "index.html", "leaderboard.parquet"

@@ -35,7 +35,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.submission import Submission
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
-from traps_pipeline.scoring.scored import Scored, score
+from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
 
@@ -57,7 +57,7 @@ class Verified:
     checked: list[str] = field(default_factory=list)
     unchecked: list[str] = field(default_factory=list)
     verdicts: pd.DataFrame | None = None
-    scored: Scored | None = None
+    scored: Scores | None = None
 
     def look(self, what: str, complaints: Iterator[str]) -> None:
         """Record a check and its problems: keep the first ones and count the others."""

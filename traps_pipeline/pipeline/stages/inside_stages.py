@@ -29,7 +29,7 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
-    from traps_pipeline.mechanism.stored import StoredStates
+    from traps_pipeline.mechanism.stored_states import StoredStates
 
 _source = partial(source, group=GROUP, kinds=["yaml"], scheme=EXTRACTION)
 _stage = partial(stage, group=GROUP, scheme=EXTRACTION, cost="machine")
@@ -60,7 +60,7 @@ def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
 
 def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
     """Return the model of an extraction, and its stored states."""
-    from traps_pipeline.mechanism.stored import StoredStates
+    from traps_pipeline.mechanism.stored_states import StoredStates
 
     model, extraction = _model(workspace, key)
     return model, StoredStates.of(workspace, extraction)
@@ -161,7 +161,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:
     """Return indirect effects of groups of positions between matched controls and voids by layer, beside nulls."""
-    from traps_pipeline.mechanism.patched import patching_rows
+    from traps_pipeline.mechanism.patching_stage import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
 

@@ -32,7 +32,7 @@ class Chunk:
     calls: Mapping[str, Request]
 
 
-class MadeAnswers:
+class SharedAnswers:
     """The stored answers of a study, and the chunks of the calls wanted here."""
 
     def __init__(self, store: Store, folder: Path, size: int) -> None:
@@ -123,7 +123,7 @@ def is_written(ledger: Ledger, evaluation: str) -> bool:
 
 
 def make_meanwhile(
-    shared: MadeAnswers,
+    shared: SharedAnswers,
     ledger: Ledger,
     evaluation: str,
     wanted: Sequence[Request],

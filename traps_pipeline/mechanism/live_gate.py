@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.capture import OF_PARTS, Pooling
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import DATASETS

@@ -18,11 +18,11 @@ from tests.conftest import ROOT
 from tests.local_models import SYSTEM, ask, clip, model
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.mechanism import patched
+from traps_pipeline.mechanism import patching_stage
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.patched import Side, best_cells, effect_of, groups_of, patching_rows, summed
 from traps_pipeline.mechanism.patching_effects import Patch, Recorded, record
+from traps_pipeline.mechanism.patching_stage import Side, best_cells, effect_of, groups_of, patching_rows, summed
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.spans import changed_tokens, spans
@@ -244,8 +244,8 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
         pairs.append((prompts[id(target)], prompts[id(source)]))
         return np.full(len(patches), float(pairs[-1][0][1] != pairs[-1][1][1]))  # 1 for frames of the other side
 
-    monkeypatch.setattr(patched, "record", recording)
-    monkeypatch.setattr(patched, "patched_changes", changes)
+    monkeypatch.setattr(patching_stage, "record", recording)
+    monkeypatch.setattr(patching_stage, "patched_changes", changes)
     made = patching_rows(workspace, entry, TINY)
     order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)
     fitting = [name for name in order if name != "plinko-2"]
@@ -264,7 +264,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     assert {row.source for row in made} == {"pair", "other scenario", "same side", "other times"}
     cells = [
         {(row.into, row.site, row.layer, row.group) for row in made if row.source == source and row.effect is not None}
-        for source in patched.SOURCES
+        for source in patching_stage.SOURCES
     ]
     assert len(cells[0]) == 2 * 6 and all(of_null == cells[0] for of_null in cells)
 
@@ -277,7 +277,7 @@ def test_a_killed_run_goes_on_behind_its_last_pair_and_gives_the_same_rows(entry
     described.write_text(entry.model_dump_json(), "utf-8")
     workspaces = [make_study(tmp_path / name) for name in ("killed", "alone")]
     for workspace in workspaces:
-        for dataset in patched.WELL_POSED:
+        for dataset in patching_stage.WELL_POSED:
             workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
 
     def start(workspace: Workspace) -> subprocess.Popen[str]:
