@@ -25,7 +25,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.hook import Site, changing
 from traps_pipeline.mechanism.live_gate import Gate, Threshold, fitted_gate
-from traps_pipeline.mechanism.other_probes import erased as erased
+from traps_pipeline.mechanism.other_probes import erase_side as erase_side
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, fit_probe
@@ -53,7 +53,7 @@ def _workspace(where: Where) -> Workspace:
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
+class LoadedStates:
     """States with their items and verdicts.
 
     X: (n, d) float32. items: n rows with item_id, dataset, scenario_id, side, sub_scenario, void, and for each regime
@@ -68,11 +68,11 @@ class Loaded:
         """Whether each item is a void, (n,) bool."""
         return self.items["void"].to_numpy(bool)
 
-    def where(self, chosen: Any) -> Loaded:
+    def where(self, chosen: Any) -> LoadedStates:
         """Return the items that a mask (n,) or a query on `items` selects."""
         mask = self.items.eval(chosen) if isinstance(chosen, str) else chosen
         mask = np.asarray(mask, bool)
-        return Loaded(self.X[mask], self.items.loc[mask].reset_index(drop=True))
+        return LoadedStates(self.X[mask], self.items.loc[mask].reset_index(drop=True))
 
 
 def load(
@@ -82,7 +82,7 @@ def load(
     layer: int | Literal["normed"],
     prompt: str = "standard",
     datasets: Sequence[str] | None = None,
-) -> Loaded:
+) -> LoadedStates:
     """Return the states of a study's items at one layer, joined with the verdicts of run 1.
 
     layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
@@ -109,7 +109,7 @@ def load(
         parts.append(items)
         vectors.append(states.read(dataset, layer))
     joined = pd.concat(parts, ignore_index=True)
-    return Loaded(np.concatenate(vectors), joined.dropna(axis=1, how="all"))
+    return LoadedStates(np.concatenate(vectors), joined.dropna(axis=1, how="all"))
 
 
 def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
@@ -133,7 +133,7 @@ def protocol(
     fit: Fit = fit_probe,
     prompt: str = "standard",
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
-    features: Loaded | None = None,
+    features: LoadedStates | None = None,
 ) -> pd.DataFrame:
     """Run the study's own protocol with another probe; return rows like those of `probe_baselines`.
 

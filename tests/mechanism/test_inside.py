@@ -159,7 +159,7 @@ def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, ent
 def test_an_erased_state_is_changed_alike_whatever_stands_beside_it(study: Workspace) -> None:
     states = inside.load(study, "tiny", layer=2, datasets=["chaotic"])
     eraser = Eraser.of(states.X, states.void)
-    assert eraser(states.X) == pytest.approx(inside.erased(states.X, states.void))
+    assert eraser(states.X) == pytest.approx(inside.erase_side(states.X, states.void))
     assert eraser(states.X[:3]) == pytest.approx(eraser(states.X)[:3])
 
 
@@ -168,7 +168,7 @@ def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_e
     void = np.arange(60) % 2 == 1
     states = rng.normal(size=(60, 8)) * rng.lognormal(size=8)
     states[void, :2] += 5
-    gone = inside.erased(states, void)
+    gone = inside.erase_side(states, void)
     assert np.abs(gone[void].mean(axis=0) - gone[~void].mean(axis=0)).max() < 1e-9
     assert np.linalg.matrix_rank(gone - gone.mean(axis=0)) == 7
     assert np.abs(LogisticRegression().fit(gone, void).coef_).max() < 1e-4
@@ -186,4 +186,4 @@ def test_the_protocol_takes_any_probe_and_any_features_of_items(study: Workspace
     figures = inside.protocol(study, "tiny", layer=2, features=some)
     assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
     with pytest.raises(TrapsError, match="lacks 2 items of chaotic"):
-        inside.protocol(study, "tiny", layer=2, features=inside.Loaded(some.X[2:], some.items.iloc[2:]))
+        inside.protocol(study, "tiny", layer=2, features=inside.LoadedStates(some.X[2:], some.items.iloc[2:]))

@@ -22,7 +22,7 @@ from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.release.harness.scoring import figures, judge
-from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
+from traps_pipeline.release.harness.write import SHOWN, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
@@ -111,7 +111,7 @@ def test_its_code_is_the_pipelines_own_and_needs_nothing_of_it(harness: Path) ->
         assert {*neighbours} <= {each.stem for each in paths}
         allowed = {*sys.stdlib_module_names, "traps_harness", "inspect_ai"}
         assert [name for name in names if name.partition(".")[0] not in allowed] == []
-    assert copied("from traps_pipeline.judging.rules import x\n") == "from traps_harness.rules import x\n"
+    assert rewritten_source("from traps_pipeline.judging.rules import x\n") == "from traps_harness.rules import x\n"
 
 
 def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_pat
     with pytest.raises(TrapsError, match="holds other files"):
         write_harness(released, copy)
     with pytest.raises(TrapsError, match="--uniform: goes with --media images"):
-        shown("video", 2)
+        media_settings("video", 2)
 
 
 # --- answers come back ------------------------------------------------------------------------------------------------

@@ -201,7 +201,7 @@ def load_scenarios(study: Study) -> dict[str, Scenario]:
     Raises TrapsError for an unknown named scenario.
     """
     check_benchmark(study)
-    return subset(folded(), study)
+    return subset(corrected_scenarios(), study)
 
 
 def check_benchmark(study: Study) -> None:
@@ -221,7 +221,7 @@ def _elsewhere(benchmark: str) -> str:
 
 
 @cache
-def folded() -> dict[str, Scenario]:
+def corrected_scenarios() -> dict[str, Scenario]:
     """Return the released records after all corrections."""
     return fold(load_released(), read_corrections())
 

@@ -19,7 +19,7 @@ from typing import Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
 from traps_pipeline.base.paths import CORRECTIONS, require_own_corrections
-from traps_pipeline.benchmark.corrections import Correction, Scenario, fold, folded, read_corrections
+from traps_pipeline.benchmark.corrections import Correction, Scenario, corrected_scenarios, fold, read_corrections
 from traps_pipeline.benchmark.records import load_released
 
 FILE = "review.jsonl"
@@ -124,7 +124,7 @@ def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]
             os.fsync(stream.fileno())
             if is_new:
                 sync_folder(folder)
-            folded.cache_clear()
+            corrected_scenarios.cache_clear()
 
         yield append
 

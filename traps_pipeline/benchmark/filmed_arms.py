@@ -16,7 +16,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
-from traps_pipeline.benchmark.corrections import folded
+from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.versions import clip_content, version_of
@@ -177,7 +177,7 @@ def arm_of(spec: SceneSpec, arm: str) -> Arm:
 @cache
 def _partners(family: str) -> dict[str, SceneSpec]:
     """Return the partners of a family's scenarios. A scenario with a corrected or added scene has none."""
-    members = [one for one in folded().values() if one.family == family]
+    members = [one for one in corrected_scenarios().values() if one.family == family]
     specs = {one.scenario_id: one.changed_words() for one in members if one.released and one.params is None}
     return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
 

@@ -28,18 +28,18 @@ SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories,
 
 
 @dataclass(frozen=True)
-class Resolved:
+class ResolvedScenario:
     """A record and the file of its trajectory."""
 
     spec: SceneSpec
     trajectory: Path
 
 
-def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
+def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenario:
     """Return the record after corrections. Only a changed or added scene is simulated, once."""
     if scenario.params is None:
         spec = scenario.changed_words()
-        return Resolved(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
+        return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
     spec, trajectory = _resolved_anew(workspace, scenario)
     words = dict(scenario.words)
     if _words_still_fit(scenario):
@@ -51,7 +51,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
             f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, "
             f"the simulation {spec.ground_truth!r}; leave the answer out or change the parameters"
         )
-    return Resolved(apply_words(spec, words, scenario.where), trajectory)
+    return ResolvedScenario(apply_words(spec, words, scenario.where), trajectory)
 
 
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
@@ -146,7 +146,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
     return SECONDS_A_RECORD * sum(one.category == category for one in load_scenarios(workspace.study).values())
 
 
-def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[Resolved]]:
+def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
     """Return a category's rows of scene_specs, and the resolved records behind them.
 
     Trajectories are compared with their digests.
@@ -205,7 +205,7 @@ def void_from_s(spec: SceneSpec) -> float:
 _AS_JSON = ("params", "physics", "camera", "void", "control", "aliases", "answerable_question", "twin")
 
 
-def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
+def _row(workspace: Workspace, item: ResolvedScenario, version: str) -> SceneSpecRow:
     spec = item.spec
     record = spec.model_dump(mode="json", exclude={"evidence"})
     for name in _AS_JSON:
@@ -249,7 +249,7 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
         raise TrapsError(str(error)) from error
 
 
-def unsettled(resolved: Sequence[Resolved]) -> list[str]:
+def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
     """Return problems of outcomes, by recomputing the certificate `outcome` from each frozen trajectory."""
     from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 

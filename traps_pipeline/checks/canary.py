@@ -19,7 +19,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.reading import read_answer
@@ -82,7 +82,7 @@ def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
     entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
     calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]
 
-    def finish(settled: Settled[Cell, _Asked]) -> list[CanaryRow]:
+    def finish(settled: SettledCell[Cell, _Asked]) -> list[CanaryRow]:
         return [_row(call, row, epoch) for call, row in settled.answered()]
 
     new = list[CanaryRow]()

@@ -24,7 +24,7 @@ from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.checks.wire_check import Studio, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
-from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import check_money
 from traps_pipeline.models.judges import JudgeEntry, Task
@@ -360,7 +360,7 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     outcomes: Mapping[str, Outcome] = {}
     if calls:
 
-        def finish(settled: Settled[Cell, Call]) -> Mapping[str, Outcome]:
+        def finish(settled: SettledCell[Cell, Call]) -> Mapping[str, Outcome]:
             return {key: _outcome(row) for key, row in settled.rows.items()}
 
         (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)

@@ -35,7 +35,7 @@ SHORT = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"
 Run = Callable[[argparse.Namespace], int]  # a command takes its parsed arguments and returns an exit code
 
 
-def whole(least: int, most: int) -> Callable[[str], int]:
+def integer(least: int, most: int) -> Callable[[str], int]:
     """Return an argparse type for a whole number from `least` to `most`, in plain digits."""
 
     def parse(text: str) -> int:
@@ -57,7 +57,7 @@ def number(above: float, most: float) -> Callable[[str], float]:
     return parse
 
 
-class LineWise(argparse.HelpFormatter):
+class LineHelpFormatter(argparse.HelpFormatter):
     """A help formatter that keeps line breaks, and wraps each line to the terminal so that examples can be copied."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
@@ -153,7 +153,7 @@ class Commands:
             help=text,
             description=text,
             epilog=example_line + codes,
-            formatter_class=LineWise,
+            formatter_class=LineHelpFormatter,
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
@@ -203,7 +203,7 @@ def _as_json(value: Any) -> Any:
 
 def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) -> None:
     """Add the arguments of a command that serves pages; `listening_of` reads them."""
-    parser.add_argument("--port", type=whole(1, 65535), default=port, help=f"port of the page (default: {port})")
+    parser.add_argument("--port", type=integer(1, 65535), default=port, help=f"port of the page (default: {port})")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
     parser.add_argument("--token", help=f"access token, instead of a fresh one (default: ${variable})")
     parser.add_argument("--behind", default="", help="https address of a reverse proxy in front (docs/people.md)")
@@ -240,10 +240,10 @@ def open_workspace(arguments: argparse.Namespace) -> Workspace:
     """Return the study that a command works in. Raises TrapsError with the remedy if there is none."""
     from traps_pipeline.storage.workspace import Workspace
 
-    return entered(Workspace.open(place_of(arguments)))
+    return enter_workspace(Workspace.open(place_of(arguments)))
 
 
-def entered(workspace: Workspace) -> Workspace:
+def enter_workspace(workspace: Workspace) -> Workspace:
     """Return the workspace after setting it in the environment, for partition keys here and in child processes."""
     from traps_pipeline.models.user_registry import clear_caches
     from traps_pipeline.storage.workspace import VARIABLE

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, open_workspace, whole
+from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace
 
 if TYPE_CHECKING:
-    from traps_pipeline.exchange.answer_exchange import Imported
+    from traps_pipeline.exchange.answer_exchange import ImportResult
 
 
 def add(commands: Commands) -> None:
@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
     add_experiment(parser)
     parser.add_argument("file", type=Path, help="the returned file")
     parser.add_argument("--model", help="the model, for a file by item (default: the experiment's only model)")
-    parser.add_argument("--run", type=whole(1, 1_000), default=1, help="the run, for a file by item (default: 1)")
+    parser.add_argument("--run", type=integer(1, 1_000), default=1, help="the run, for a file by item (default: 1)")
     parser.add_argument("--key", type=Path, help="key of the held-out set that the file answers")
     parser.add_argument(
         "--errors", choices=("drop", "keep"), help="texts that look like error messages: leave them out, or import them"
@@ -99,7 +99,7 @@ def _exported(files: Sequence[Path], count: int, command: str) -> int:
     return OK
 
 
-def _imported(imported: Imported, arguments: argparse.Namespace, what: str) -> int:
+def _imported(imported: ImportResult, arguments: argparse.Namespace, what: str) -> int:
     print(f"{imported.new} {what} imported, {imported.known} were there already")
     if imported.dropped:
         print(f"{imported.dropped} error messages were left out; what they stand for is still missing")

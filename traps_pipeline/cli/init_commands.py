@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, add_experiment, add_panel, entered, experiment_of, place_of
+from traps_pipeline.cli.command import OK, Commands, add_experiment, add_panel, enter_workspace, experiment_of, place_of
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
@@ -66,7 +66,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     experiments = workspace.study.experiments | {experiment.name: experiment.asked}
     if experiments != workspace.study.experiments:
         workspace = workspace.allow(experiments=experiments)
-    entered(workspace)
+    enter_workspace(workspace)
     save_entries(workspace)
     if not (workspace.dagster_home / "dagster.yaml").exists():
         from traps_pipeline.pipeline.run import dagster_history

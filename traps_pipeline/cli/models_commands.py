@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import FAILED, OK, Commands, entered, open_workspace, place_of, print_json
+from traps_pipeline.cli.command import FAILED, OK, Commands, enter_workspace, open_workspace, place_of, print_json
 
 
 def add(commands: Commands) -> None:
@@ -59,7 +59,7 @@ def _named(arguments: argparse.Namespace) -> list[str]:
 
     place = place_of(arguments)
     if Workspace.is_there(place):
-        entered(Workspace.open(place))
+        enter_workspace(Workspace.open(place))
     names, panels = list[str](), {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
     for name in arguments.names:
         if name in panels:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace, print_json, whole
+from traps_pipeline.cli.command import FAILED, OK, Commands, integer, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("folder", type=Path, help="an empty or new folder")
     parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
     parser.add_argument(
-        "--uniform", type=whole(1, 1000), metavar="N",
+        "--uniform", type=integer(1, 1000), metavar="N",
         help="show N evenly spaced frames of a clip, if the model's entry says so (default: 25, at 5 a second)",
     )  # fmt: skip
 
@@ -157,10 +157,10 @@ def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
 
 def harness(arguments: argparse.Namespace) -> int:
     """See `traps publish harness --help`."""
-    from traps_pipeline.release.harness.write import LMMS, shown, write_harness
+    from traps_pipeline.release.harness.write import LMMS, media_settings, write_harness
 
     target = arguments.folder.absolute()
-    count = write_harness(arguments.release, target, shown(arguments.media, arguments.uniform))
+    count = write_harness(arguments.release, target, media_settings(arguments.media, arguments.uniform))
     print(f"{count} items in {target}")
     print(f"next: inspect eval {target / 'traps_task.py'} -T regime=standard --model MODEL")
     print(f"or: python -m lmms_eval --include_path {target / LMMS} --tasks traps_standard --model MODEL --log_samples")

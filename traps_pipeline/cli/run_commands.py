@@ -20,11 +20,11 @@ from traps_pipeline.cli.command import (
     add_experiment,
     add_panel,
     experiment_of,
+    integer,
     load_definitions,
     number,
     print_failure,
     print_json,
-    whole,
 )
 from traps_pipeline.cli.init_commands import create
 
@@ -76,7 +76,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--runs",
-        type=whole(1, 500),
+        type=integer(1, 500),
         default=40,
         help="number of runs per group of stages with --cluster (default: 40)",
     )
@@ -85,7 +85,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--cpus",
-        type=whole(1, 1000),
+        type=integer(1, 1000),
         default=1,
         help="with --cluster: cores per run that renders clips or fits probes (default: 1)",
     )

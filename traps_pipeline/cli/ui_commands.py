@@ -6,7 +6,7 @@ import argparse
 import os
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, number, open_workspace, whole
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, integer, number, open_workspace
 
 CLUSTER = "of a study on a cluster"
 _OWN_S = 5.0  # time for the second process itself, after its children have ended
@@ -16,10 +16,10 @@ def add(commands: Commands) -> None:
     """Add `traps ui`."""
     text = "start Dagster's web server and daemon; print the address to open, with its token"
     parser = commands.add("study ui", ui, text, example="--port 3001")
-    parser.add_argument("--port", type=whole(1, 65535), default=3000, help="port of the web server (default: 3000)")
+    parser.add_argument("--port", type=integer(1, 65535), default=3000, help="port of the web server (default: 3000)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
     parser.add_argument(
-        "--cpus", type=whole(1, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
+        "--cpus", type=integer(1, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
     )
     parser.add_argument(
         "--gpus", type=number(0, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"

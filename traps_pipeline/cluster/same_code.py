@@ -26,10 +26,12 @@ def code_here() -> str:
     versions of Python and of every installed package that `pyproject.toml` names.
     """
     folders = {"the package": PACKAGE, "assets": ASSETS, "scene_specs": SCENE_SPECS}
-    return json.dumps({f"files of {name}": _digest_of(folder) for name, folder in folders.items()} | installed())
+    return json.dumps(
+        {f"files of {name}": _digest_of(folder) for name, folder in folders.items()} | installed_versions()
+    )
 
 
-def installed() -> dict[str, str]:
+def installed_versions() -> dict[str, str]:
     """Return installed versions of Python, of this package, and of its dependencies, by name.
 
     Builds for other hardware (`+cpu`, `+cu128`) count as the same version.

@@ -96,7 +96,7 @@ class Answer(BaseModel):
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportResult:
     """The result of an import.
 
     It has the numbers of new answers and of answers already in the ledger; the failed calls, in words, which stay
@@ -205,7 +205,7 @@ def import_answers(
     path: Path,
     context: AnswerContext | None = None,
     errors: Literal["drop", "keep"] | None = None,
-) -> Imported:
+) -> ImportResult:
     """Import answers into the ledger; `traps run` then builds tables from them.
 
     path: JSON lines, see `Answer`; or answers by item, see `exchange.harness_logs`. All lines are checked before any is
@@ -239,7 +239,7 @@ def import_answers(
     ]
     new = asyncio.run(_store(workspace, workspace.answers, stored))
     failed = f"{n_failed} samples of the log" if n_failed else ""
-    return Imported(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
+    return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
@@ -281,7 +281,7 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
     return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)
 
 
-def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
+def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
     """Import a batch of votes into their ledger; `traps run` then builds tables from them.
 
     Raises TrapsError as `import_answers` does.
@@ -308,7 +308,7 @@ def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
 
 def _import_batch(
     workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], requested: Mapping[str, Request], path: Path
-) -> Imported:
+) -> ImportResult:
     returned = read_batch(path, requested)
     if not returned:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
@@ -318,7 +318,7 @@ def _import_batch(
     ]
     new = asyncio.run(_store(workspace, ledger, stored))
     failed = sum(one.outcome.kind in ("error", "malformed") for one in stored)
-    return Imported(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
+    return ImportResult(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:

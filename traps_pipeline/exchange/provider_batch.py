@@ -144,7 +144,7 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class Returned:
+class BatchResult:
     """A provider's result of a call: a status and a body, or the reason for their absence in one word."""
 
     status: int = 0
@@ -163,12 +163,12 @@ def is_batch(path: Path) -> bool:
     return False
 
 
-def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]:
+def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResult]:
     """Return the results in a file of OpenAI's, vLLM's, Gemini's or Anthropic's form, by key.
 
     Raises TrapsError naming lines that are no results, and unwanted or repeated keys.
     """
-    answers, wrong = dict[str, Returned](), list[str]()
+    answers, wrong = dict[str, BatchResult](), list[str]()
     for number, line in read_lines(path):
         try:
             key, returned = _returned(json.loads(line))
@@ -187,22 +187,22 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]
     return answers
 
 
-def _returned(line: Any) -> tuple[str, Returned]:
+def _returned(line: Any) -> tuple[str, BatchResult]:
     if "result" in line:  # Anthropic
         result = line["result"]
         if result["type"] == "succeeded":
-            return line["custom_id"], Returned(200, json.dumps(result["message"]).encode())
-        return line["custom_id"], Returned(error=_word(result["type"]))
+            return line["custom_id"], BatchResult(200, json.dumps(result["message"]).encode())
+        return line["custom_id"], BatchResult(error=_word(result["type"]))
     key = line["custom_id"] if "custom_id" in line else line["key"]
     error, response = line.get("error"), line.get("response")
     status = int((response or {}).get("status_code") or 0)
     if error and status >= FAILED:  # vLLM: a status without a body, and beside it what it would have been
-        return key, Returned(status, json.dumps({"error": error.get("error") or error}).encode())
+        return key, BatchResult(status, json.dumps({"error": error.get("error") or error}).encode())
     if error:
-        return key, Returned(error=_word(error.get("code") or error.get("status") or "error"))
+        return key, BatchResult(error=_word(error.get("code") or error.get("status") or "error"))
     if "custom_id" in line:  # OpenAI, vLLM
-        return key, Returned(status, json.dumps(response["body"]).encode())
-    return key, Returned(200, json.dumps(response).encode())  # Gemini
+        return key, BatchResult(status, json.dumps(response["body"]).encode())
+    return key, BatchResult(200, json.dumps(response).encode())  # Gemini
 
 
 def _word(value: Any) -> str:
@@ -211,7 +211,7 @@ def _word(value: Any) -> str:
 
 
 def outcomes_of(
-    entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, Returned]
+    entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, BatchResult]
 ) -> Iterator[tuple[Request, Outcome]]:
     """Yield each returned call with its outcome, read like a live call's."""
     by_name: dict[str, list[str]] = {}

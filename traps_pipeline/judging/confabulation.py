@@ -23,15 +23,15 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
-from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quote
 from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.ask import Call, Settled
+from traps_pipeline.models.ask import Call, SettledCell
 from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.schemas import structured
+from traps_pipeline.models.schemas import structured_output
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.ratings import AXES
@@ -45,7 +45,7 @@ TASK = "confabulation"
 # The parts of a failure's id, which people's labels refer to: another answer is another failure. They are in the
 # protocol's digest, so that the table is rebuilt when the parts change.
 SAMPLED = ("cell", "item", "answer", "trace that the judge sees")
-SCHEMA = structured(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
+SCHEMA = structured_output(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
 TRACE_AND_OUTPUT, OUTPUT = "trace_and_output", "output"
 Evidence = Literal["trace_and_output", "output"]
 VOID_KINDS: Mapping[str, str] = {
@@ -135,7 +135,7 @@ def void_kind(dataset: str) -> str:
     return "occluder" if dataset == "occlusion" else "truncation"
 
 
-def drawn(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+def draw_sample(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """Return a seeded sample of n keys without replacement (all keys if there are fewer), independent of order."""
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
 
@@ -159,7 +159,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
         return {}
     failures = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
     sample: dict[Cell, list[Failure]] = {}
-    for key in drawn(protocol.seed, protocol.n, failures):
+    for key in draw_sample(protocol.seed, protocol.n, failures):
         cell, row = failures[key]
         trace = row["reasoning"] if protocol.models[model] == TRACE_AND_OUTPUT else None
         request = label_request(judge, cell, row, row["text"], trace)
@@ -184,9 +184,9 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
     """Return the user message to the judge."""
-    parts = [quoted("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
+    parts = [quote("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
     about = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
-    return "\n\n".join([*about, *parts, quoted("response", "RESPONSE", answer)])
+    return "\n\n".join([*about, *parts, quote("response", "RESPONSE", answer)])
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
@@ -223,8 +223,8 @@ def collect_labels(workspace: Workspace) -> StageOutput:
     for model in protocol.models:
         samples |= sample_failures(workspace, judge, model)
 
-    def finish(settled: Settled[Cell, Failure]) -> tuple[Cell, StageOutput]:
-        return settled.made(_label_row)
+    def finish(settled: SettledCell[Cell, Failure]) -> tuple[Cell, StageOutput]:
+        return settled.output(_label_row)
 
     for _, output in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
         table.extend(output.rows(CONFABULATION))

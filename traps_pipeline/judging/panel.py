@@ -31,7 +31,7 @@ from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, asked_items
-from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
+from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
 from traps_pipeline.models.judges import (
@@ -65,7 +65,7 @@ def tasks_for(side: str) -> tuple[Task, ...]:
     return ("abstention", "correctness") if side == "control" else ("abstention",)
 
 
-def quoted(what: str, name: str, text: str) -> str:
+def quote(what: str, name: str, text: str) -> str:
     """Return a model's text between marker lines with its digest, which the text itself cannot contain."""
     marker = f"{name}-{digest(text)[:12]}"
     return (
@@ -79,7 +79,7 @@ def render(task: Task, question: str, answer: str, ground_truth: str | None) -> 
     parts = [f"Question: {question}"]
     if task == "correctness":
         parts.append(f"Ground truth: {ground_truth}")
-    return "\n\n".join([*parts, quoted("response", "RESPONSE", answer)])
+    return "\n\n".join([*parts, quote("response", "RESPONSE", answer)])
 
 
 def about_answer(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
@@ -225,7 +225,7 @@ class Ballot(Call):
 
 
 @dataclass(frozen=True)
-class Part(Cell):
+class AnswerSlice(Cell):
     """A slice of a cell's answers: a large cell's votes are collected slice by slice, to bound memory."""
 
     start: int
@@ -246,20 +246,20 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     parts = {cell: _parts(workspace, cell) for cell in cells}
     done: dict[Cell, list[StageOutput]] = {}
 
-    def calls(part: Part) -> list[Ballot]:
+    def calls(part: AnswerSlice) -> list[Ballot]:
         return wanted_ballots(workspace, panel, part.whole, part.start, PART)
 
     every = [part for of in parts.values() for part in of]
-    for part, output in ask_judges(workspace, "votes", panel, every, calls, lambda settled: settled.made(row_of)):
+    for part, output in ask_judges(workspace, "votes", panel, every, calls, lambda settled: settled.output(row_of)):
         done.setdefault(part.whole, []).append(output)
         if len(done[part.whole]) == len(parts[part.whole]):
             yield part.whole, joined(done.pop(part.whole))
 
 
-def _parts(workspace: Workspace, cell: Cell) -> list[Part]:
+def _parts(workspace: Workspace, cell: Cell) -> list[AnswerSlice]:
     state = workspace.tables.state(RESPONSES, cell.partition)
     starts = range(0, state.rows if state else 0, PART) or range(1)  # a cell without answers has one empty part
-    return [Part(cell.dataset, cell.evaluation, start) for start in starts]
+    return [AnswerSlice(cell.dataset, cell.evaluation, start) for start in starts]
 
 
 def ask_judges(
@@ -268,7 +268,7 @@ def ask_judges(
     judges: Iterable[JudgeEntry],
     cells: Sequence[AnyCell],
     calls: Callable[[AnyCell], Sequence[AnyCall]],
-    finish: Callable[[Settled[AnyCell, AnyCall]], Finished],
+    finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
 ) -> Iterator[Finished]:
     """Call `collect` for judges, with the ledger of votes."""
     return collect(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)

@@ -22,7 +22,7 @@ from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
-from traps_pipeline.models.ask import Settled
+from traps_pipeline.models.ask import SettledCell
 from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, YES, majority
@@ -118,7 +118,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
         for request in vote_requests(panel, task, CELL, attacks.item(text), answer)
     ]
 
-    def finish(settled: Settled[Cell, Ballot]) -> Votes:
+    def finish(settled: SettledCell[Cell, Ballot]) -> Votes:
         if settled.tally.errors:
             raise TrapsError(
                 f"{settled.tally.errors} calls to the judges failed; run the same command again: only they are asked"

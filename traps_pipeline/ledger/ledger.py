@@ -24,11 +24,11 @@ from traps_pipeline.ledger.rows import (
     AVERAGED,
     NOT_WHOLE,
     SIDE_TEXTS,
-    Known,
+    EvaluationRows,
     Stored,
     Totals,
     digest_of,
-    encoded,
+    encode_row,
     heal,
     participant_of,
     settles,
@@ -44,7 +44,7 @@ Waiting = Callable[[str], None]  # called once with the holder of the lock
 GiveUp = Callable[[], bool]  # returns whether to stop waiting
 
 
-def never() -> bool:
+def wait_forever() -> bool:
     """Return False: wait without end."""
     return False
 
@@ -61,13 +61,13 @@ class Ledger:
 
     # --- reading ------------------------------------------------------------------------------------------------------
 
-    def read(self, evaluation: str, wanted: Collection[str] | None = None) -> Known:
+    def read(self, evaluation: str, wanted: Collection[str] | None = None) -> EvaluationRows:
         """Return the rows of an evaluation; with `wanted`, parse and hold only those keys.
 
         If a key has several rows the newest counts, but a failure never replaces an answer. Damaged rows, and values
         that no table can hold, are noted and ignored. Raises TrapsError.
         """
-        known = Known()
+        known = EvaluationRows()
         for place, row, note in self._parsed(evaluation, wanted):
             if note:
                 known.notes[place] = note
@@ -173,7 +173,7 @@ class Ledger:
     # --- writing ------------------------------------------------------------------------------------------------------
 
     @asynccontextmanager
-    async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = never) -> AsyncIterator[Writer]:
+    async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = wait_forever) -> AsyncIterator[Writer]:
         """Become the one writer of an evaluation; while another process is, wait and report it once.
 
         Raises LockGivenUp when `give_up` returns true while waiting, and TrapsError.
@@ -241,7 +241,7 @@ class _Content:
     def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
         """Encode a row. Raises ValueError if JSON cannot hold it."""
         asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
-        return cls(row, encoded(row), asides)
+        return cls(row, encode_row(row), asides)
 
     def values(self, evaluation: int) -> dict[str, Any]:
         asides = {name: self.asides.get(name) for name in SIDE_TEXTS}

@@ -91,7 +91,7 @@ def participant_of(row: Mapping[str, Any]) -> str:
     return participant if isinstance(participant, str) else "unknown"
 
 
-def encoded(row: Mapping[str, Any]) -> bytes:
+def encode_row(row: Mapping[str, Any]) -> bytes:
     """Return a row as JSON. Raises ValueError for NaN, which JSON lacks."""
     return json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
 
@@ -105,7 +105,7 @@ def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | No
 
 
 @dataclass
-class Known:
+class EvaluationRows:
     """The readable rows of one evaluation.
 
     rows: the newest row of each key; a failure never replaces an answer. notes: by place, warnings about rows that are

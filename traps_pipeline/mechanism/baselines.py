@@ -61,9 +61,9 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     raw = raw_features(items, entry.media, workspace.resolve)
     for number, (name, features) in enumerate(raw.items()):
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
-        add(name, scored(run, features))
+        add(name, score_features(run, features))
     try:
-        add(MARGIN, scored(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
+        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
     except NoMargin as error:
         add(MARGIN, [_without_figure()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
@@ -78,7 +78,7 @@ class AsItIs:
         return states[:, 0]
 
 
-def scored(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Row]:
+def score_features(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Row]:
     """Return the protocol's rows on features instead of states, including nearest centroids.
 
     fit: a probe other than the protocol's.
@@ -202,7 +202,7 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     groups: dict[tuple[str, ...], list[Row]] = {}
     for draw in range(draws):
         vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
-        for row in scored(run, {name: vectors[rows] for name, rows in of.items()}):
+        for row in score_features(run, {name: vectors[rows] for name, rows in of.items()}):
             groups.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
     rows = []
     for same in groups.values():

@@ -16,7 +16,7 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.directions import cosine_matrix
 from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, CosineRow
-from traps_pipeline.mechanism.nulls import nulled
+from traps_pipeline.mechanism.nulls import nan_to_null
 from traps_pipeline.mechanism.stages import direction_pairs, saved_directions
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import FAMILIES
@@ -115,7 +115,9 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
                             other_prompt=other.extraction.prompt,
                             other_dataset=other_dataset,
                             cosine=float(cosines[i, j]),
-                            **nulled(_figures(differences[i], differences[j], weights) | {"split_half": halves[i]}),
+                            **nan_to_null(
+                                _figures(differences[i], differences[j], weights) | {"split_half": halves[i]}
+                            ),
                         )
                     )
     return rows

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.gate import (
 )
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBES
-from traps_pipeline.mechanism.nulls import nulled
+from traps_pipeline.mechanism.nulls import nan_to_null
 from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
@@ -286,7 +286,7 @@ def _row(
     return GateRow(
         **states.extraction.partition,
         **named,
-        **nulled(figures),
+        **nan_to_null(figures),
         layer=layer,
         n_controls=sides[0],
         n_voids=sides[1],

@@ -33,7 +33,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
-from traps_pipeline.storage.leases import alone, leased
+from traps_pipeline.storage.leases import alone, leased_ranges
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 from traps_pipeline.storage.store import FolderStore
@@ -141,7 +141,7 @@ def extract(
     with alone(here, _WRITING):
         _look_for(folder, known)
     total = sum(key not in known for key in keys)
-    for chunk in leased(here, "chunks", len(items), shard_size):
+    for chunk in leased_ranges(here, "chunks", len(items), shard_size):
         if any(keys[n] not in known for n in chunk):
             _look_for(folder, known)  # another process may have made this chunk
         missing = [(items[n], keys[n]) for n in chunk if keys[n] not in known]
@@ -221,7 +221,7 @@ def _make(
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
     """Return the states of an item, pooled over the tokens that the pooling names."""
     chosen = _chosen(model, prompt, item, pooling)
-    with model.remembering_clips():
+    with model.caching_clips():
         return model.forward_states(prompt, pooling, chosen=chosen)
 
 

@@ -39,7 +39,7 @@ class Gate:
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
         """Return the probe's log-odds of void for a prompt, from one pass of the plain model."""
-        with model.remembering_clips():
+        with model.caching_clips():
             states = model.forward_states(prompt, self.pooling).raw[self.layer]
         return float(self.probe.scores(states[None])[0])
 

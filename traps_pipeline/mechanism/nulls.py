@@ -77,7 +77,7 @@ def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
             )
 
 
-def nulled(figures: Mapping[str, float]) -> dict[str, Any]:
+def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
     """Return the figures with null instead of NaN, as in tables."""
     return {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
 
@@ -103,7 +103,7 @@ def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
         rows.append(
             SteeringPecsRow(
                 **dict(zip(keys, key if isinstance(key, tuple) else (key,), strict=True)),
-                **nulled(figures),
+                **nan_to_null(figures),
                 degenerate=(control["degenerate"] + void["degenerate"]) / answers,
                 n_controls=int(control["n"]),
                 n_voids=int(void["n"]),

@@ -76,6 +76,6 @@ class Eraser:
         return states - np.outer((states - self.mean) @ self.read, self.written)
 
 
-def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
+def erase_side(states: np.ndarray, void: np.ndarray) -> np.ndarray:
     """Return states (n, d) from which no linear classifier can tell the sides, by the `Eraser` of these very states."""
     return Eraser.of(states, void)(states)

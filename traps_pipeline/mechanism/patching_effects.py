@@ -39,7 +39,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.models.local.capture import first_tensor
-from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, given, giving, unknown_path
+from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, argument_of, unknown_path, with_argument
 from traps_pipeline.models.local.spans import visual_tokens
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedPass:
     """The recorded decoder part of a pass.
 
     inputs: the decoder's arguments, after the vision tower. states: by site and layer, (T, d); always the residual
@@ -116,7 +116,7 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
             yield site, layer, part
 
 
-def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> Recorded:
+def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
     """Run one pass and keep what a patch may need, at the residual stream and at `sites`.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
@@ -140,12 +140,12 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
         states[site, layer] = first_tensor(output)[0].clone()
 
     def keep_own(block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        own = given(block, PER_LAYER, args, kwargs)
+        own = argument_of(block, PER_LAYER, args, kwargs)
         if own is not None:
             per_layer.append(own[0])
 
     def keep_shared(layer: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any], _: Any) -> None:
-        for name, (keys, values) in (given(block, SHARED, args, kwargs) or {}).items():
+        for name, (keys, values) in (argument_of(block, SHARED, args, kwargs) or {}).items():
             if name not in shared or shared[name][1] is not keys:
                 shared[name] = layer, keys, values
 
@@ -158,15 +158,15 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
         for layer, block in enumerate(model.blocks, start=1):
             hooks.callback(block.register_forward_pre_hook(keep_own, with_kwargs=True).remove)
             hooks.callback(block.register_forward_hook(partial(keep_shared, layer), with_kwargs=True).remove)
-        hooks.enter_context(model.remembering_clips())
+        hooks.enter_context(model.caching_clips())
         last = model.forward(prompt).last_hidden_state[:, -1]
         states["residual", 0] = inputs["inputs_embeds"][0].clone()
         margin = float(first_token_margins(model, last, tokens)[0])
-        return Recorded(inputs, states, margin, visual_tokens(model, prompt), tuple(per_layer), shared)
+        return RecordedPass(inputs, states, margin, visual_tokens(model, prompt), tuple(per_layer), shared)
 
 
 def patched_changes(
-    model: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], tokens: Sequence[int]
+    model: LocalModel, target: RecordedPass, source: RecordedPass, patches: Sequence[Patch], tokens: Sequence[int]
 ) -> np.ndarray:
     """Measure the change of the target's outcome by each patch from the source, (patches,).
 
@@ -190,7 +190,7 @@ def patched_changes(
 
 
 def attributed_changes(
-    model: LocalModel, target: Recorded, source: Recorded, tokens: Sequence[int]
+    model: LocalModel, target: RecordedPass, source: RecordedPass, tokens: Sequence[int]
 ) -> dict[tuple[Site, int], np.ndarray]:
     """Estimate the change of the target's outcome by patching each token alone, (T,) by recorded site and layer.
 
@@ -218,7 +218,7 @@ def attributed_changes(
 Weights = Mapping[tuple[Site, int], "Tensor"]
 
 
-def _require_one_form(target: Recorded, source: Recorded) -> None:
+def _require_one_form(target: RecordedPass, source: RecordedPass) -> None:
     if not np.array_equal(target.pictures, source.pictures):
         raise TrapsError(
             f"a prompt of {source.length} tokens cannot be patched into one of {target.length}, or their visual tokens "
@@ -261,8 +261,8 @@ def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
 
 def _margins(
     model: LocalModel,
-    target: Recorded,
-    source: Recorded,
+    target: RecordedPass,
+    source: RecordedPass,
     weights: Weights,
     start: int,
     rows: int,
@@ -283,7 +283,7 @@ def _margins(
     return first_token_margins(model, last, tokens)
 
 
-def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
+def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
     """Return the decoder's inputs for several rows of one prompt."""
     import torch
 
@@ -300,7 +300,7 @@ def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
 
 @contextmanager
 def _replacing(
-    model: LocalModel, target: Recorded, source: Recorded, weights: Weights, start: int, rows: int
+    model: LocalModel, target: RecordedPass, source: RecordedPass, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
     """Let passes start behind block `start` and replace states by the source's; undo everything at the end."""
 
@@ -315,10 +315,10 @@ def _replacing(
         """Return the arguments of the block above `below` others, with the source's where the stream below was
         patched.
         """
-        own, behind = given(block, PER_LAYER, args, kwargs), _behind(weights, below)
+        own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
         if own is not None and behind is not None:
-            args, kwargs = giving(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
-        shared = given(block, SHARED, args, kwargs)  # one mapping, which all blocks are given
+            args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
+        shared = argument_of(block, SHARED, args, kwargs)  # one mapping, which all blocks are given
         if shared is not None and below == start:
             for name, (maker, *pair) in target.shared.items():
                 if maker <= start:

@@ -30,7 +30,7 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.patching_effects import (
     Patch,
-    Recorded,
+    RecordedPass,
     attributed_changes,
     patched_changes,
     record,
@@ -85,7 +85,7 @@ def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
     for dataset in WELL_POSED:
         if workspace.tables.state(PROBE_ITEMS, {"dataset": dataset}) is not None:
             changes = Pairs(workspace, entry, extraction, dataset, model, settings).changes()
-            rows += summed(*changes, extraction, dataset, workspace.mechanism.seed)
+            rows += summarize_effects(*changes, extraction, dataset, workspace.mechanism.seed)
     if not rows:
         raise TrapsError("patching: no pairs of a well-posed dataset; materialize probe_items first")
     return rows
@@ -182,7 +182,7 @@ class Pairs:
         source = record(self._model, own.prompt, self._tokens, self._settings.sites)
         return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
 
-    def _patched(self, target: Recorded, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
+    def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return the margin of a source, and the changes by patches from it; free its states afterwards."""
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
@@ -280,7 +280,7 @@ def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: i
     return sorted(cell for cells in by_size for cell in cells)
 
 
-def summed(
+def summarize_effects(
     estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
 ) -> Iterator[PatchingRow]:
     """Yield the rows of a dataset: ratios of sums over pairs, with intervals by scenario for measured patches.

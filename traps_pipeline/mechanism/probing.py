@@ -141,7 +141,7 @@ class ProbeRun:
         for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
             rows += of_layer
             progress(done, self.n_layers)
-        return marked(rows + self._problems())
+        return mark_layers(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
         """Return every row of one layer, whose states are in memory only during this call."""
@@ -366,7 +366,7 @@ def _row(
     }
 
 
-def marked(rows: Sequence[Row]) -> list[Row]:
+def mark_layers(rows: Sequence[Row]) -> list[Row]:
     """Return the rows with flags on the layers that tables show.
 
     own_best: the maximum of the row's own curve (the paper's choice, which uses target labels); all_sample_best: the

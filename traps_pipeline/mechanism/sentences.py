@@ -51,7 +51,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
             prompt = probed_item(workspace, model, entry.media, about, system_prompt(regime)).prompt()
             text = texts.get(about["item_id"])
             own = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
-            with model.remembering_clips():
+            with model.caching_clips():
                 likely = {name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()}
                 answer = mean_log_probability(model, prompt, own) if own else None
             best = max(likely, key=lambda name: likely[name])

@@ -59,7 +59,7 @@ class SteeredBackend(LocalBackend):
                 vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
                 hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
             most = requests[0].params["max_new_tokens"]
-            with model.remembering_clips():
+            with model.caching_clips():
                 generated = model.generate(prompts, most, None, hook, stopped=stopped)
             for number, one in zip(numbers, generated, strict=True):
                 counts = (one.prompt_tokens, one.completion_tokens)

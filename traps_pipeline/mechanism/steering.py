@@ -29,7 +29,7 @@ from traps_pipeline.mechanism.shared_answers import SharedAnswers, is_written, m
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
-from traps_pipeline.models.ask import Settled, collect
+from traps_pipeline.models.ask import SettledCell, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
@@ -291,11 +291,11 @@ def collect_steered(
         store.chunks([each.request for each in questions])
         return questions
 
-    def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
+    def finish(settled: SettledCell[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
         store.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
-        return settled.made(partial(_steering_row, plain))
+        return settled.output(partial(_steering_row, plain))
 
     def make(entry: Entry) -> SteeredBackend:
         return SteeredBackend(entry, vectors, store)
@@ -352,7 +352,7 @@ def collect_steering_votes(
     """
     panel = load_panel(workspace.study.panel)
     calls = partial(wanted_steering_ballots, workspace, panel)
-    yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
+    yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.output(_vote_row))
 
 
 def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:

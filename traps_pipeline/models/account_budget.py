@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_in_place, remedy, write_bytes
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, is_whole
+from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, is_whole, line_with_checksum
 
 CAP, SPENT = "budget.yaml", "spent.jsonl"
 _COMPACTED = 2**20  # bytes of lines above which a run compacts them at its start
@@ -53,7 +53,7 @@ class AccountBudget:
         self._descriptor, self._read = -1, 0
         with self._held():
             if self._read > _COMPACTED:
-                content = b"".join(checked_line({"study": name, "usd": usd}) for name, usd in self._spent.items())
+                content = b"".join(line_with_checksum({"study": name, "usd": usd}) for name, usd in self._spent.items())
                 write_bytes(self._path, content, durable=True)  # other processes notice the new file and read it
 
     @property
@@ -149,7 +149,7 @@ class AccountBudget:
         self._read = size
 
     def _append(self, dollars: float) -> None:
-        line = checked_line({"study": self.study, "usd": dollars})
+        line = line_with_checksum({"study": self.study, "usd": dollars})
         append_whole(self._descriptor, line)
         self._spent[self.study] += dollars
         self._read += len(line)

@@ -13,8 +13,8 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.answer_rows import ResponseRow
-from traps_pipeline.models.ask import Call, Settled, collect
-from traps_pipeline.models.framing import framed
+from traps_pipeline.models.ask import Call, SettledCell, collect
+from traps_pipeline.models.framing import media_for_dataset
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import read_answer
@@ -46,7 +46,7 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
     The clip's media are prepared here if they are missing; every regime and run then shares them.
     """
     clip, dataset = workspace.resolve(item["clip"]), dataset_of(item["item_id"])
-    spec = framed(entry.media, dataset) if entry.media else None
+    spec = media_for_dataset(entry.media, dataset) if entry.media else None
     media = workspace.media.prepare(clip, item["media_digest"], spec) if spec else None
     return Request(
         participant=entry.id,
@@ -64,7 +64,7 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
 
 def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]) -> bool:
     """Return whether the media of an item's clip are prepared for this model."""
-    spec = framed(entry.media, dataset_of(item["item_id"])) if entry.media else None
+    spec = media_for_dataset(entry.media, dataset_of(item["item_id"])) if entry.media else None
     return spec is None or workspace.media.known(item["media_digest"], spec) is not None
 
 
@@ -74,7 +74,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
     for dataset, own in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
         if own is None:
             continue
-        spec = framed(own, dataset)
+        spec = media_for_dataset(own, dataset)
         items = [*asked_items(workspace, dataset)]
         workspace.bring(item["clip"] for item in items)
         for item in items:
@@ -164,9 +164,11 @@ def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tup
     """Ask for missing answers; yield the RESPONSES rows of each cell as it is done."""
     prepare_media(workspace, cells)
 
-    def finish(settled: Settled[Cell, Question]) -> tuple[Cell, StageOutput]:
+    def finish(settled: SettledCell[Cell, Question]) -> tuple[Cell, StageOutput]:
         traces = workspace.answers.reasoning(settled.cell.evaluation.key, settled.rows)
-        return settled.made(lambda cell, question, row: response_row(cell, question.item, row, traces.get(row["key"])))
+        return settled.output(
+            lambda cell, question, row: response_row(cell, question.item, row, traces.get(row["key"]))
+        )
 
     entries, calls = [get_model(cell.evaluation.model) for cell in cells], partial(wanted_questions, workspace)
     yield from collect(workspace, "responses", workspace.answers, entries, cells, calls, finish)

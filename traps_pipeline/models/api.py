@@ -22,7 +22,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.models.budget import worst_case_usd
 from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
 from traps_pipeline.models.endings import Ending
-from traps_pipeline.models.first_token import stored
+from traps_pipeline.models.first_token import stored_alternatives
 from traps_pipeline.models.provider_errors import ProviderError, read_error, retry_after_s
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
@@ -211,7 +211,7 @@ class ApiBackend:
             completion_tokens=believed and believed.completion,
             reasoning_tokens=believed and believed.reasoning,
             cost_usd=self._cost(usage, request),
-            first_token=stored(reply.first_token, request.about.get("regime")),
+            first_token=stored_alternatives(reply.first_token, request.about.get("regime")),
         )
 
     def _cost(self, usage: Usage | None, request: Request) -> float | None:

@@ -23,7 +23,7 @@ from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
 from traps_pipeline.ledger.rows import settles
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget, BudgetReached
-from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.models.spending import sharing, spending
@@ -50,7 +50,7 @@ Finished = TypeVar("Finished")
 
 
 @dataclass(frozen=True)
-class Settled(Generic[AnyCell, AnyCall]):
+class SettledCell(Generic[AnyCell, AnyCall]):
     """A cell whose calls are all answered: its calls, the ledger's row of each key, and the tally."""
 
     cell: AnyCell
@@ -62,7 +62,7 @@ class Settled(Generic[AnyCell, AnyCall]):
         """Return each call with its ledger row."""
         return ((call, self.rows[call.request.key]) for call in self.calls)
 
-    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
+    def output(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
         """Return the cell and its table, one row per call, with the tally of its calls."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
         counts = {"wanted": len(self.rows), "known": self.tally.cached, "asked": self.tally.asked}
@@ -83,7 +83,7 @@ class Work(Generic[AnyCell, AnyCall, Finished]):
     budget: Budget
     epoch: str
     calls: Callable[[AnyCell], Sequence[AnyCall]]
-    finish: Callable[[Settled[AnyCell, AnyCall]], Finished]
+    finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished]
 
 
 def collect(
@@ -93,7 +93,7 @@ def collect(
     entries: Iterable[Entry],
     cells: Sequence[AnyCell],
     calls: Callable[[AnyCell], Sequence[AnyCall]],
-    finish: Callable[[Settled[AnyCell, AnyCall]], Finished],
+    finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
     make: Callable[[Entry], Backend] = make_backend,
 ) -> Iterator[Finished]:
     """Ask participants for the calls that the ledger lacks, under the study's budget; yield each finished cell.
@@ -137,7 +137,7 @@ class _Asking:
         if not queue or self.halted():
             return False
         request, name = queue.popleft(), participant.entry.id
-        allowed = Allowed(self.work.budget, self.stop, self.halted, self.writer.require)
+        allowed = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
         attempted = await attempt(participant, request, allowed)
         if attempted is None:
             return False
@@ -210,7 +210,7 @@ class _Evaluation:
 
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
-) -> AsyncIterator[Settled[AnyCell, AnyCall]]:
+) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
     """Settle the cells of one evaluation, asking only for missing calls. Unfinished cells are left out.
 
     Calls and rows are held one cell at a time; a call that two cells share (a steered control) is found by the second.
@@ -228,7 +228,7 @@ async def settle_evaluation(
 
 async def _settle_cell(
     work: Work[AnyCell, AnyCall, Any], cell: AnyCell, its: _Evaluation, stop: asyncio.Event
-) -> Settled[AnyCell, AnyCall] | None:
+) -> SettledCell[AnyCell, AnyCall] | None:
     """Ask for a cell's missing calls; return None if that was stopped."""
     report = progress.current()
     calls = work.calls(cell)
@@ -250,14 +250,14 @@ async def _settle_cell(
     await its.writer.sync()
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
-    return Settled(cell, calls, {key: rows[key] for key in requests}, tally)
+    return SettledCell(cell, calls, {key: rows[key] for key in requests}, tally)
 
 
 async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
-) -> AsyncIterator[Settled[AnyCell, AnyCall] | Exception]:
+) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models in parallel. A failing model yields its exception; the others go on."""
-    done: asyncio.Queue[Settled[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
+    done: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
@@ -289,7 +289,7 @@ async def settle(
                 open_tasks -= 1
             else:
                 yield settled
-                if isinstance(settled, Settled):
+                if isinstance(settled, SettledCell):
                     turn.release()
     finally:
         for task in tasks:

@@ -27,7 +27,7 @@ def of_chat(logprobs: Any) -> dict[str, float]:
     return {}
 
 
-def stored(alternatives: Mapping[str, float], regime: object) -> str | None:
+def stored_alternatives(alternatives: Mapping[str, float], regime: object) -> str | None:
     """Return alternatives in stored form, the likeliest first; None without any, or if the regime uses none."""
     if not alternatives or regime not in BY_NAME or not BY_NAME[str(regime)].first_token:
         return None

@@ -10,7 +10,7 @@ _LATER = {"frames_later": 1}  # frames of the clip
 CLIP_S = 5  # of a whole clip (docs/spec.md 2)
 
 
-def framed(spec: MediaSpec, dataset: str) -> MediaSpec:
+def media_for_dataset(spec: MediaSpec, dataset: str) -> MediaSpec:
     """Return the media settings for a dataset's clips: as in the entry, or with other frames."""
     if dataset in _RATES:
         rate = _RATES[dataset]
@@ -18,7 +18,7 @@ def framed(spec: MediaSpec, dataset: str) -> MediaSpec:
     return spec.model_copy(update={"later": _LATER[dataset]}) if dataset in _LATER else spec
 
 
-def observed(dataset: str) -> FramePolicy:
+def observer_frames(dataset: str) -> FramePolicy:
     """Return the frames that the observer answers from: 5 a second, or as the dataset varies them."""
-    spec = framed(MediaSpec(profile="frames", fps=5), dataset)
+    spec = media_for_dataset(MediaSpec(profile="frames", fps=5), dataset)
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later)

@@ -29,7 +29,7 @@ from traps_pipeline.models.registry import (
     read_entries,
     with_own,
 )
-from traps_pipeline.models.schemas import structured
+from traps_pipeline.models.schemas import structured_output
 from traps_pipeline.models.thinking import Marks
 
 JUDGES_FILE = ASSETS / "judges.yaml"
@@ -49,8 +49,8 @@ _ABSTENTION: Mapping[str, Any] = {
     "reasoning": {"type": "string"},
 }
 SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
-    "abstention": structured("abstention", **_ABSTENTION),
-    "correctness": structured(
+    "abstention": structured_output("abstention", **_ABSTENTION),
+    "correctness": structured_output(
         "correctness",
         correct={"type": "boolean"},
         extracted_value={"anyOf": [{"type": "string"}, {"type": "number"}, {"type": "null"}]},
@@ -59,7 +59,7 @@ SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
 }
 
 
-_WITH_PREMISE = structured("abstention", **_ABSTENTION, rejects_premise={"type": "boolean"})
+_WITH_PREMISE = structured_output("abstention", **_ABSTENTION, rejects_premise={"type": "boolean"})
 
 
 class Judge(typing.Protocol):
@@ -219,6 +219,6 @@ def panel_names(panels: str) -> list[str]:
     return [one.partition("@")[0] for one in panels.split("+") if one]
 
 
-def by_rules(panels: str, model: str) -> bool:
+def is_judged_by_rules(panels: str, model: str) -> bool:
     """Return whether rules judged a model that is no reference model, by the column `panel` of a row."""
     return RULES_PANEL in panel_names(panels) and not is_reference(model)

@@ -115,7 +115,7 @@ class Participants:
 
 
 @dataclass(frozen=True)
-class Allowed:
+class CallContext:
     """A call's context besides its participant, one value per call.
 
     stop: set when the run is to end. halted(): whether to stop sending calls. require(): raises TrapsError if only
@@ -129,7 +129,9 @@ class Allowed:
     paid_by: list[Reservation] = field(default_factory=list)
 
 
-async def attempt(participant: Participant, request: Request, allowed: Allowed) -> tuple[Outcome, int, float] | None:
+async def attempt(
+    participant: Participant, request: Request, allowed: CallContext
+) -> tuple[Outcome, int, float] | None:
     """Return an outcome, the number of attempts, the last one's seconds; None if halted before anything was spent.
 
     This is the one retry layer: exponential backoff with full jitter, and never sooner than the provider asks. The
@@ -187,7 +189,7 @@ def _given_up(
     return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
 
 
-async def _send(participant: Participant, request: Request, allowed: Allowed) -> Outcome:
+async def _send(participant: Participant, request: Request, allowed: CallContext) -> Outcome:
     """Send one attempt under a reservation and return its outcome.
 
     Raises TransientError and BudgetReached, and TrapsError before it is sent. A call costs its worst case from the

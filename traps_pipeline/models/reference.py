@@ -15,7 +15,7 @@ from statistics import NormalDist
 from typing import Any
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.models.first_token import stored
+from traps_pipeline.models.first_token import stored_alternatives
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.protocol.regimes import fields_of
@@ -49,7 +49,7 @@ def _sometimes(parameter: str) -> Strategy:
     return strategy
 
 
-def believed(request: Request) -> dict[str, float]:
+def believed_probabilities(request: Request) -> dict[str, float]:
     """Return the probability that `bayes` assigns to each answer.
 
     It follows the futures of a graded cut, otherwise the oracle's knowledge (nothing about a void). noise: standard
@@ -67,7 +67,7 @@ def believed(request: Request) -> dict[str, float]:
 
 def _bayes(request: Request) -> str | None:
     """Return the most probable answer, if its probability reaches `answers_from`."""
-    belief = believed(request)
+    belief = believed_probabilities(request)
     best = max(belief, key=lambda label: belief[label])
     return best if belief[best] >= request.params["answers_from"] else None
 
@@ -108,7 +108,7 @@ def _stated(answer: str | None, request: Request) -> dict[str, Any]:
 
 def _belief(answer: str | None, request: Request) -> dict[str, float]:
     if request.params.get("strategy") == "bayes":
-        return believed(request)
+        return believed_probabilities(request)
     return {answer: 1.0} if answer else {}
 
 
@@ -132,7 +132,7 @@ class ReferenceBackend:
             finish_reason="stop",
             served_model=request.participant,
             cost_usd=0.0,
-            first_token=stored(belief, request.about.get("regime")),
+            first_token=stored_alternatives(belief, request.about.get("regime")),
         )
 
     def _misfortune(self, request: Request) -> Outcome | None:

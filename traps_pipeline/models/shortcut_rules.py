@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from traps_pipeline.models.framing import observed
-from traps_pipeline.models.observer import seen
+from traps_pipeline.models.framing import observer_frames
+from traps_pipeline.models.observer import observer_answer
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
@@ -67,5 +67,5 @@ def _answer(request: Request, clip: Path) -> str | None:
     question = request.user
     if any(CUES[cue](request.media_digest, clip, question) for cue in RULES[str(request.params["rule"])]):
         return None
-    frames = observed(dataset_of(str(request.about["item_id"])))
-    return seen(request.media_digest, clip, question, frames) or str(request.secret["commonest_answer"])
+    frames = observer_frames(dataset_of(str(request.about["item_id"])))
+    return observer_answer(request.media_digest, clip, question, frames) or str(request.secret["commonest_answer"])

@@ -119,7 +119,7 @@ class Meter:
         return wait
 
 
-class Stopped(TrapsError):
+class ParticipantStopped(TrapsError):
     """A participant that is no longer asked; the others go on."""
 
 
@@ -147,13 +147,13 @@ class Breaker:
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
-        """Raise Stopped for a participant that was stopped before (`remembering_stops`)."""
+        """Raise ParticipantStopped for a participant that was stopped before (`remembering_stops`)."""
         for stopped in _stopped:
             if self._participant in stopped:
-                raise Stopped(stopped[self._participant])
+                raise ParticipantStopped(stopped[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raise Stopped after five consecutive unsent calls, the first of them some time ago.
+        """Raise ParticipantStopped after five consecutive unsent calls, the first of them some time ago.
 
         A restarted server has that long. why: why the last one was not sent.
         """
@@ -168,7 +168,7 @@ class Breaker:
         self._unmade, self._unmade_since = 0, 0.0
 
     def watch(self, outcome: Outcome) -> None:
-        """Raise Stopped after repeated failures.
+        """Raise ParticipantStopped after repeated failures.
 
         These are 20 consecutive refusals of the same kind, three consecutive malformed answers, or more than 10
         failures in the last 100 calls.
@@ -196,7 +196,7 @@ class Breaker:
         )
         for stopped in _stopped:
             stopped.setdefault(self._participant, message)  # calls in flight return later, and raise too
-        raise Stopped(message)
+        raise ParticipantStopped(message)
 
 
 def _refusal(outcome: Outcome) -> str:

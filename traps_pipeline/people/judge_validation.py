@@ -20,7 +20,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.agreement import cohen_kappa
-from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, drawn, load_protocol, sample_id
+from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, draw_sample, load_protocol, sample_id
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -60,7 +60,7 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
     if labels.empty:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
-    chosen = drawn(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
+    chosen = draw_sample(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
     return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
 
 

@@ -133,7 +133,7 @@ def _unit(*shown: str) -> str:
 
 
 def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """Return the sampled units for people, in the columns of `units`: `drawn`, or the sheet's failures."""
+    """Return the sampled units for people, in the columns of `units`: `draw_sample`, or the sheet's failures."""
     population = units(workspace, task)
     if population.empty:
         return population

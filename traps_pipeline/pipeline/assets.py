@@ -9,7 +9,7 @@ from pydantic import PrivateAttr
 
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
-from traps_pipeline.pipeline.step import Event, guarded, run_step
+from traps_pipeline.pipeline.step import Event, guard_events, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.tables import Table
@@ -90,7 +90,7 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
         ],
     )
     def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
-        events = guarded(run_step(stage, context, workspace.open()), context)
+        events = guard_events(run_step(stage, context, workspace.open()), context)
         yield from workspace.until_torn_down(events)
 
     return asset

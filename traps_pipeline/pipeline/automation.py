@@ -14,7 +14,7 @@ import dagster as dg
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import folded
+from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.models.judges import load_judges, load_panel
@@ -58,7 +58,7 @@ def reread_sources() -> None:
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
-    for cached in (load_released, folded, prompt, system_prompt, vqa_prompt, *registries):
+    for cached in (load_released, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
         cached.cache_clear()
 
 

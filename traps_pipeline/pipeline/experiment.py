@@ -131,9 +131,9 @@ class Experiment(BaseModel):
                 f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; edit one of them"
             )
         named = panel or (base.panel if study else self.panel) or self.panel or ""
-        by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
-        require_panel(named, self.models, judged_by_rules=by_rules)
-        return base.model_copy(update={"panel": named, "judged_by_rules": by_rules})
+        is_judged_by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
+        require_panel(named, self.models, judged_by_rules=is_judged_by_rules)
+        return base.model_copy(update={"panel": named, "judged_by_rules": is_judged_by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
         """Raise TrapsError if an existing study has another panel, epoch or `mechanism` section than this one."""

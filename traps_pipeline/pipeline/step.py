@@ -169,7 +169,7 @@ class _Step:
         return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
 
 
-def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
+def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
     """Forward a step's events, with progress in Dagster's log and without keys in the traceback that it stores.
 
     A run stopped by a signal is canceled; Dagster, which did not stop it itself, would call it a failure.

@@ -190,7 +190,7 @@ def drawn_again(
         return load_released(Path(folder) / "released")
 
 
-def same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
+def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
     """Return whether two records differ only in fields that depend on a machine's arithmetic."""
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 

@@ -16,7 +16,7 @@ from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.models.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
-from traps_pipeline.release.verification import Verified, verify
+from traps_pipeline.release.verification import Verification, verify
 from traps_pipeline.report.leaderboard_page import leaderboards, legend
 from traps_pipeline.report.writing import environment, table_html
 from traps_pipeline.scoring.scores import score
@@ -27,11 +27,11 @@ TITLE = "TRAPSBench: submissions"
 
 
 @dataclass(frozen=True)
-class Accepted:
+class AcceptedSubmission:
     """A submission without problems, and its verification."""
 
     submission: Submission
-    verified: Verified
+    verified: Verification
 
     @property
     def name(self) -> str:
@@ -47,7 +47,7 @@ class Accepted:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedSubmission:
     """A file that is not ranked, with the reason."""
 
     name: str
@@ -76,8 +76,8 @@ class Board:
     """All submissions of a page."""
 
     groups: list[RankedGroup] = field(default_factory=list)
-    accepted: list[Accepted] = field(default_factory=list)
-    refused: list[Refused] = field(default_factory=list)
+    accepted: list[AcceptedSubmission] = field(default_factory=list)
+    refused: list[RefusedSubmission] = field(default_factory=list)
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
@@ -87,14 +87,14 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
         try:
             submission = read_submission(path)
         except TrapsError as error:
-            board.refused.append(Refused(path.name, [str(error)]))
+            board.refused.append(RefusedSubmission(path.name, [str(error)]))
             say(f"{path}: refused")
             continue
         verified = verify(submission, release)
         if verified.problems:
-            board.refused.append(Refused(path.name, verified.problems))
+            board.refused.append(RefusedSubmission(path.name, verified.problems))
         else:
-            board.accepted.append(Accepted(submission, verified))
+            board.accepted.append(AcceptedSubmission(submission, verified))
         say(f"{path}: {'refused' if verified.problems else 'verified'}")
     names = Counter(one.name for one in board.accepted)
     twice = [name for name, n in names.items() if n > 1]
@@ -103,14 +103,14 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
     if not board.accepted:
         why = "; ".join(f"{one.name}: {one.problems[0]}" for one in board.refused[:3])
         raise TrapsError(f"no submission holds, so there is nothing to rank ({why})")
-    groups: dict[tuple[str, str], list[Accepted]] = {}
+    groups: dict[tuple[str, str], list[AcceptedSubmission]] = {}
     for one in board.accepted:
         groups.setdefault(one.group, []).append(one)
     board.groups = [_group(key, members) for key, members in sorted(groups.items())]
     return board
 
 
-def _group(key: tuple[str, str], members: Sequence[Accepted]) -> RankedGroup:
+def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> RankedGroup:
     """Return the members' verdicts scored together, so that their differences are paired over the same scenarios."""
     owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
@@ -125,7 +125,7 @@ def _group(key: tuple[str, str], members: Sequence[Accepted]) -> RankedGroup:
     return RankedGroup(*key, versions, items, score(verdicts).board, submissions)
 
 
-def _verdicts(one: Accepted) -> pd.DataFrame:
+def _verdicts(one: AcceptedSubmission) -> pd.DataFrame:
     verdicts = one.verified.verdicts
     assert verdicts is not None  # a submission without verdicts has a problem, and is not accepted
     return verdicts

@@ -46,7 +46,7 @@ Row = Mapping[str, Any]
 
 
 @dataclass
-class Verified:
+class Verification:
     """The result of a verification.
 
     problems: one sentence each; checked and unchecked: what was verified, and what could not be. verdicts and scored:
@@ -68,9 +68,9 @@ class Verified:
             self.problems.append(f"... and {len(problems) - SHOWN} more of this kind")
 
 
-def verify(submission: Submission, release: Path | None = None) -> Verified:
+def verify(submission: Submission, release: Path | None = None) -> Verification:
     """Verify a submission, against a released folder if given. Raises TrapsError for an unreadable release."""
-    verified = Verified()
+    verified = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
     verified.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
@@ -78,7 +78,7 @@ def verify(submission: Submission, release: Path | None = None) -> Verified:
     verified.look("prompts", _wrong_prompts(submission))
     verified.look("answers", _wrong_answers(answers, items))
     verified.look("panel", _wrong_panel(submission, votes))
-    by_rules = all(seat.backend == RULE for seat in submission.about.judges)
+    is_judged_by_rules = all(seat.backend == RULE for seat in submission.about.judges)
     verified.look("votes", _wrong_votes(submission, votes, answers, items))
     _numbers(verified, submission)
     if release is None:
@@ -87,7 +87,7 @@ def verify(submission: Submission, release: Path | None = None) -> Verified:
         verified.look("items and clips against the release", _strangers(items, release))
     verified.unchecked.append("that the answers are the model's: only who asked it knows")
     verified.unchecked.append("that the clips named by digest are those that the model was sent")
-    if not by_rules:
+    if not is_judged_by_rules:
         verified.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
     return verified
 
@@ -268,7 +268,7 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def _numbers(verified: Verified, submission: Submission) -> None:
+def _numbers(verified: Verification, submission: Submission) -> None:
     """Compute verdicts, metrics and leaderboard from the votes; record how the submission's numbers differ."""
     own = id_of_judges(submission.about.panel, submission.about.judges)
     try:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
+from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.table_columns import (
@@ -185,7 +185,7 @@ def judged_by(board: pd.DataFrame) -> str:
     sentence = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
     sentence += "; figures of different panels are not ranked or compared" * several
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
-    others = sorted({model for panel, model in rows if by_rules(panel, model)})
+    others = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
     names_shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
     return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if others else "")
 

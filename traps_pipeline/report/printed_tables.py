@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.report.tables.table_columns import DATASET, MODEL, titled
+from traps_pipeline.report.tables.table_columns import DATASET, MODEL, with_titles
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.analyses import models_of
@@ -111,7 +111,7 @@ def expanded() -> list[PrintedTable]:
 def replication_per_dataset() -> list[PrintedTable]:
     """Return the two replication families on each dataset under each regime."""
     keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in PRINTED_REGIMES]
-    cells = titled(_cells("replication").set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
+    cells = with_titles(_cells("replication").set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
     return [of_paper("replication_per_dataset", cells, [MODEL, DATASET, REGIME, *figures(SHARES)])]
 
 
@@ -132,7 +132,7 @@ def visual_textual() -> list[PrintedTable]:
 def naive() -> list[PrintedTable]:
     """Return the cells under guided in which Acc × AbsRec exceeds PECS most."""
     rows = as_printed("pecs_vs_naive")
-    rows = titled(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
+    rows = with_titles(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
     names = {"naive": "Naive", "pecs": "PECS", "false_abs_pct": "FA"}
     return [of_paper("pecs_naive", rows, [MODEL, DATASET, *figures(names)])]
 
@@ -197,7 +197,7 @@ def hyperparameters() -> list[PrintedTable]:
 def agreement() -> list[PrintedTable]:
     """Return unanimity and Fleiss' kappa by dataset and task."""
     rows = as_printed("judge_agreement")
-    rows = titled(rows.assign(unanimous_pct=rows["unanimous_pct"] + "%"))
+    rows = with_titles(rows.assign(unanimous_pct=rows["unanimous_pct"] + "%"))
     columns = [DATASET, Column("task", "Judge task"), *figures({"unanimous_pct": "Unan.", "fleiss_kappa": "κ"})]
     return [of_paper("judge_agreement", rows, columns)]
 

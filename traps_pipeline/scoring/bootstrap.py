@@ -34,7 +34,7 @@ _IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squar
 
 
 @dataclass(frozen=True)
-class Resampled:
+class ResampledFigures:
     """The mean over runs of every figure, observed and in every resample.
 
     entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64; values:
@@ -51,7 +51,7 @@ class Resampled:
         return self.values[:, :, RESAMPLED.index(name)]
 
 
-def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> Resampled:
+def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledFigures:
     """Resample every (model, regime) on each of its datasets, and overall.
 
     Overall is the equal-weight mean over the four datasets, over the runs that have all four. Figures are computed per
@@ -74,12 +74,12 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
             observed.append(mean[1, :, 0])
             values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
     nothing = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
-    return Resampled(
+    return ResampledFigures(
         entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else nothing
     )
 
 
-def intervals(resampled: Resampled, level: float = _LEVEL) -> pd.DataFrame:
+def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFrame:
     """Return 95 % intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry; null where nothing is decided."""
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)

@@ -23,7 +23,7 @@ from traps_pipeline.scoring.bootstrap import (
     ENTRY,
     RESAMPLED,
     RESAMPLES,
-    Resampled,
+    ResampledFigures,
     difference,
     interval,
     limits_of,
@@ -42,7 +42,7 @@ _SIDES = ["left_model", "left_regime", "right_model", "right_regime"]
 _Side = tuple[str, str]  # model, regime
 
 
-def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
+def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
     """Return CONTRASTS rows from the bootstrap, and from the METRICS and VERDICTS rows behind it.
 
     METRICS rows give the figures, VERDICTS rows the items and epochs. The rows compare every pair of models under each

@@ -182,27 +182,27 @@ def decided(item: GradedItem, label: str | None) -> dict[str, float]:
     """
     posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
     best, own = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
-    ideal, answers = max(0.0, earned(best)), label is not None
-    points = earned(own) if answers else 0.0
+    ideal, answers = max(0.0, expected_points(best)), label is not None
+    points = expected_points(own) if answers else 0.0
     return {
         "answers": float(answers),
         "wrong": 1 - own if answers else np.nan,
         "points": points,
         "regret": ideal - points,
-        "regret_label": earned(best) - earned(own) if answers else 0.0,
-        "regret_rash": ideal - earned(best) if answers else 0.0,
+        "regret_label": expected_points(best) - expected_points(own) if answers else 0.0,
+        "regret_rash": ideal - expected_points(best) if answers else 0.0,
         "regret_shy": 0.0 if answers else ideal,
-        "abstains_right": np.nan if earned(best) > 0 else float(not answers),
-        "abstains_wrong": float(not answers) if earned(best) > 0 else np.nan,
+        "abstains_right": np.nan if expected_points(best) > 0 else float(not answers),
+        "abstains_wrong": float(not answers) if expected_points(best) > 0 else np.nan,
         "brier_ideal": brier(posterior, posterior),
         "brier_even": brier(posterior, even),
         "points_ideal": ideal,
-        "points_best": earned(best),
-        "points_prior": earned(posterior.get(item.commonest, 0.0)),
+        "points_best": expected_points(best),
+        "points_prior": expected_points(posterior.get(item.commonest, 0.0)),
     }
 
 
-def earned(probability: float) -> float:
+def expected_points(probability: float) -> float:
     """Return the expected points of an answer that is right with this probability."""
     return probability - WRONG_COSTS * (1 - probability)
 

@@ -26,7 +26,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
 from traps_pipeline.people.human_label_rows import LABELS_FILE
 from traps_pipeline.people.labels import label_lines
-from traps_pipeline.storage.lines import append_whole, checked_line
+from traps_pipeline.storage.lines import append_whole, line_with_checksum
 
 DATABASE = "labels.sqlite"
 HANDLE_DIGITS = 24
@@ -50,7 +50,7 @@ class NotWaiting(TrapsError):
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownUnit:
     """A unit that was shown to a person. at: seconds since 1970, when it was last shown; waits: it has no label yet."""
 
     task: str
@@ -94,13 +94,13 @@ class LabelStore:
         content = "\0".join((who, task, unit)).encode()
         return hmac.new(self._secret.encode(), content, "sha256").hexdigest()[:HANDLE_DIGITS]
 
-    def shown(self, who: str) -> list[Shown]:
+    def shown(self, who: str) -> list[ShownUnit]:
         """Return the units shown to a person, in all tasks, the latest last."""
         with self._database() as database:
             rows = database.execute(
                 "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
             ).fetchall()
-        return [Shown(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
+        return [ShownUnit(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
 
     def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:
         """Record that a unit is shown to a person now and waits for a label."""
@@ -152,7 +152,7 @@ class LabelStore:
                 rows = database.execute(f"SELECT {names} FROM labels WHERE seq > ? ORDER BY seq", (last,)).fetchall()
             records = [dict(zip(names.split(", "), row, strict=True)) for row in rows]
             append_whole(
-                descriptor, b"".join(checked_line(row | {"label": json.loads(row["label"])}) for row in records)
+                descriptor, b"".join(line_with_checksum(row | {"label": json.loads(row["label"])}) for row in records)
             )
             os.fsync(descriptor)
             if is_new:

@@ -26,7 +26,7 @@ def alone(store: Store, name: str) -> Iterator[None]:
         yield
 
 
-def leased(store: Store, work: str, items: int, size: int) -> Generator[range]:
+def leased_ranges(store: Store, work: str, items: int, size: int) -> Generator[range]:
     """Yield ranges of at most `size` items, each under a lease that ends when the next range is requested.
 
     Ranges that no other process holds come first, then the others as they are released, finished or not. Raises

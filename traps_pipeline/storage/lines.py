@@ -16,7 +16,7 @@ _TAIL = len(_SUM) + 16 + len(b'"}\n')
 NOT_WHOLE = "not what was written"
 
 
-def checked_line(row: Mapping[str, Any]) -> bytes:
+def line_with_checksum(row: Mapping[str, Any]) -> bytes:
     """Return a non-empty row as a JSON line whose last field is its checksum. Raises ValueError for NaN."""
     body = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()[:-1]
     return body + _SUM + _sum_of(body) + b'"}\n'
@@ -27,7 +27,7 @@ def _sum_of(body: bytes) -> bytes:
 
 
 def is_whole(line: bytes) -> bool:
-    """Return whether a line is undamaged output of `checked_line`."""
+    """Return whether a line is undamaged output of `line_with_checksum`."""
     tail = line[-_TAIL:]
     return tail.startswith(_SUM) and tail.endswith(b'"}\n') and tail[len(_SUM) : -3] == _sum_of(line[:-_TAIL])
 
@@ -43,7 +43,7 @@ class Line:
 
 
 def read_checked(path: Path) -> Iterator[Line]:
-    """Yield the lines of a file that `append_whole` and `checked_line` wrote, damaged ones included."""
+    """Yield the lines of a file that `append_whole` and `line_with_checksum` wrote, damaged ones included."""
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):  # the last one; that which lacks only its end, or has another one, is whole

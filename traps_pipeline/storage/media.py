@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_bytes
-from traps_pipeline.storage.lines import NOT_WHOLE, checked_line, read_checked
+from traps_pipeline.storage.lines import NOT_WHOLE, line_with_checksum, read_checked
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.video.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.video.policies import FramePolicy
@@ -131,12 +131,10 @@ def sample(clip: Path, spec: MediaSpec) -> Frames:
     frames, times = decode(clip)
     chosen = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(resized(frames[chosen], spec.size, spec.fit), times[chosen], clip_fps)
+    return Frames(resize(frames[chosen], spec.size, spec.fit), times[chosen], clip_fps)
 
 
-def resized(
-    frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch"
-) -> np.ndarray:
+def resize(frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch") -> np.ndarray:
     """Return frames (N, H, W, 3) uint8 at another width and height; unchanged if size is None.
 
     With fit `crop` they keep their shape: they are resized until they cover the size, and their middle is kept.
@@ -150,7 +148,7 @@ def resized(
         scale = max(size[0] / width, size[1] / height)
         covering = max(size[0], round(width * scale)), max(size[1], round(height * scale))
         left, top = (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2
-        return np.ascontiguousarray(resized(frames, covering)[:, top : top + size[1], left : left + size[0]])
+        return np.ascontiguousarray(resize(frames, covering)[:, top : top + size[1], left : left + size[0]])
     # Bit-exact, since the pixels are in the ledger key: other filters may differ between CPUs.
     return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_LINEAR_EXACT) for frame in frames])
 
@@ -280,7 +278,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(sampled.times_s.tolist())
     media = Media(spec.profile, path, sha256, len(times), times, rate, size)
-    write_bytes(note, checked_line({name: value for name, value in asdict(media).items() if name != "path"}))
+    write_bytes(note, line_with_checksum({name: value for name, value in asdict(media).items() if name != "path"}))
     return media
 
 

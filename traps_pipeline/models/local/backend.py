@@ -14,8 +14,8 @@ from threading import Event
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.first_token import stored
-from traps_pipeline.models.framing import framed
+from traps_pipeline.models.first_token import stored_alternatives
+from traps_pipeline.models.framing import media_for_dataset
 from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
@@ -104,7 +104,7 @@ class LocalBackend:
         return [
             replace(
                 outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model),
-                first_token=stored(one.first_token, request.about.get("regime")),
+                first_token=stored_alternatives(one.first_token, request.about.get("regime")),
             )
             for request, one in zip(batch.requests, generated, strict=True)
         ]
@@ -113,7 +113,7 @@ class LocalBackend:
 def _frames(request: Request, spec: MediaSpec) -> Frames:
     assert request.media is not None, "local models are asked about clips"
     try:
-        return sample(request.media, framed(spec, dataset_of(str(request.about.get("item_id", "")))))
+        return sample(request.media, media_for_dataset(spec, dataset_of(str(request.about.get("item_id", "")))))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
 

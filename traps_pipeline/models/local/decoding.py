@@ -37,7 +37,7 @@ class Steers(Protocol):
         ...
 
 
-def steered(steering: Steers | None, model: DecodingModel) -> AbstractContextManager[None]:
+def steering_context(steering: Steers | None, model: DecodingModel) -> AbstractContextManager[None]:
     """Return the steering's context, or one that does nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
@@ -61,7 +61,7 @@ def decode(
     inputs: dict[str, Any] = model.placed(collate(prompts, pad))
     first = _FirstToken()
     processors = [first, SeededNucleus(sampling)] if sampling else [first]
-    with torch.inference_mode(), steered(steering, model):
+    with torch.inference_mode(), steering_context(steering, model):
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,

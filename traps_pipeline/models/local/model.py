@@ -15,7 +15,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
-from traps_pipeline.models.local.decoding import Steers, decode, steered
+from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, batches
 from traps_pipeline.models.local.sampling import Sampling
@@ -173,7 +173,7 @@ class LocalModel:
             )
         return text
 
-    def remembering_clips(self) -> AbstractContextManager[None]:
+    def caching_clips(self) -> AbstractContextManager[None]:
         """Cache the vision tower's output per clip within the block (`clips`)."""
         return self.clips.remembering(self.network)
 
@@ -203,7 +203,7 @@ class LocalModel:
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
             prompt = self._answered(prompt, steering)
-        with steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
+        with steering_context(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
             self.forward(prompt)
         assert captured.normed is not None and len(captured.raw) == self.n_layers + 1
         rows = torch.stack([row.float().cpu() for row in (*captured.raw, captured.normed)]).numpy()

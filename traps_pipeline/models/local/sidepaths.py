@@ -41,14 +41,14 @@ def unknown_path(config: Any, block: Module) -> str | None:
     return None
 
 
-def given(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Return a call's argument of a block; None if the block lacks it or the call omits it."""
     names = _arguments(type(block))
     place = names.index(name) if name in names else len(args)
     return args[place] if place < len(args) else kwargs.get(name)
 
 
-def giving(
+def with_argument(
     block: Module, name: Argument, value: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Return the arguments of a call of a block with one of them replaced."""

@@ -10,7 +10,13 @@ from traps_pipeline.benchmark import filmed_arms, stored_evidence
 from traps_pipeline.benchmark import videos as clips
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.items import build_items
-from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
+from traps_pipeline.benchmark.specs import (
+    build_specs,
+    corrections_version,
+    released_version,
+    seconds_left,
+    unsettled_outcomes,
+)
 from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.pipeline.stage import is_declared, of, source, stage
@@ -56,7 +62,7 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
             "outcome_settled",
             "In the replay of the frozen trajectory, every outcome is the ground truth, is settled in time, and has "
             "the margin in its record.",
-            lambda workspace, key, output: unsettled(output.beside),
+            lambda workspace, key, output: unsettled_outcomes(output.beside),
         ),
         Check(
             "control_certified",

@@ -64,7 +64,7 @@ _PUBLISHED = ("acc", "abs_rec", "false_abs", "pecs")
 
 
 @dataclass
-class Written:
+class SiteSummary:
     """A summary of a site: files and bytes by kind, and missing clips."""
 
     answers: int = 0
@@ -82,7 +82,7 @@ def site_files(workspace: Workspace) -> dict[str, bytes]:
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
 
-def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Written:
+def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> SiteSummary:
     """Write a study's explorer and report to a self-contained folder, and return a summary.
 
     Files of an earlier site in the folder are replaced, or removed if they are no longer needed; `index.html` is
@@ -93,7 +93,7 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Wri
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
     existing = {name for name in names if workspace.resolve(name).is_file()}
-    summary = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
+    summary = SiteSummary(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
     page = workspace.reports / REPORT
     report = {REPORT: workspace.store.here(page).read_bytes()} if workspace.store.has(page) else {}
     files = report | _files(workspace, answers, scenarios, existing, "", report=bool(report))

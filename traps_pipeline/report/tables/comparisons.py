@@ -31,8 +31,8 @@ from traps_pipeline.report.tables.table_columns import (
     no_overall,
     ordered,
     rightly_empty,
-    titled,
     together,
+    with_titles,
 )
 from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
@@ -131,7 +131,7 @@ def naive(results: Results) -> list[PrintedTable]:
     cells = results.cells.loc[results.cells["regime"] == GUIDED]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
-    rows = titled(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
+    rows = with_titles(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
     columns = [
         MODEL, DATASET, SHARES[0], SHARES[1], SHARES[2], PECS,
         Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
@@ -151,7 +151,7 @@ def naive(results: Results) -> list[PrintedTable]:
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
     """Return cells with PECS 0: voids are not told from controls, or no control is answered correctly."""
-    rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
+    rows = ordered(with_titles(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
@@ -189,7 +189,7 @@ def reasoning(results: Results) -> list[PrintedTable]:
     refused += sorted({reason for reason in reasons if reason})
     table = table.loc[[reason is None for reason in reasons]].reset_index(drop=True)
     table = counted(table, cells, [(member, "regime", "dataset") for member in ("thinking", "other")])
-    table = ordered(titled(table), ["thinking", "regime", "dataset"])
+    table = ordered(with_titles(table), ["thinking", "regime", "dataset"])
     columns = [
         Column("thinking", "Thinking"), Column("other", "Other"), REGIME, DATASET,
         *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
@@ -233,7 +233,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
 
 def regime_tests(results: Results) -> list[PrintedTable]:
     """Return McNemar's test of two regimes on the same items, by dataset, model and run."""
-    rows = ordered(titled(results.regime_tests), ["dataset", "model", "run", "decision"])
+    rows = ordered(with_titles(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
         DATASET, MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
         Column("left_regime", "Left"), Column("right_regime", "Right"), Column("n", "n", "count"),

@@ -16,7 +16,7 @@ from traps_pipeline.report.tables.table_columns import (
     cell_trace,
     epochs,
     ordered,
-    titled,
+    with_titles,
 )
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 
@@ -29,7 +29,7 @@ def agreement(results: Results) -> list[PrintedTable]:
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
-    rows = ordered(titled(rows), ["dataset", "task"])
+    rows = ordered(with_titles(rows), ["dataset", "task"])
     columns = [
         DATASET, Column("task", "Task"), Column("agreement", "Unanimous %", "percent"),
         Column("fleiss_kappa", "Fleiss’ κ", "fraction"), Column("alpha", "Krippendorff’s α", "fraction"),
@@ -53,7 +53,7 @@ def _undefined(rows: pd.DataFrame) -> list[str]:
 
 def judge_bias(results: Results) -> list[PrintedTable]:
     """Return the bias of every judge against the panel, and PECS without that judge."""
-    bias = ordered(titled(results.bias), ["dataset", "task", "judge"])
+    bias = ordered(with_titles(results.bias), ["dataset", "task", "judge"])
     columns = [
         DATASET, Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),
         Column("panel_yes", "Panel’s yes %", "percent"), Column("bias", "Bias, points", "percent"),
@@ -62,7 +62,7 @@ def judge_bias(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     left = results.leave_one_out
     left = left.loc[left["dataset"] == "overall"] if "overall" in set(left["dataset"]) else left
-    left = ordered(titled(left), ["model", "regime", "without"])
+    left = ordered(with_titles(left), ["model", "regime", "without"])
     without = [
         MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),

@@ -25,7 +25,7 @@ from traps_pipeline.report.tables.table_columns import (
     no_overall,
     ordered,
     ranks,
-    titled,
+    with_titles,
 )
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
@@ -95,7 +95,7 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
     """Return the replication families' figures on each dataset."""
     cells = marked(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
-    rows = ordered(titled(rows), ["model", "dataset", "regime"])
+    rows = ordered(with_titles(rows), ["model", "dataset", "regime"])
     columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     why = "no model of the replication families"

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import DATASET, MISSING, PECS, SHARES, N, epochs, marked, marks, titled
+from traps_pipeline.report.tables.table_columns import (
+    DATASET,
+    MISSING,
+    PECS,
+    SHARES,
+    N,
+    epochs,
+    marked,
+    marks,
+    with_titles,
+)
 from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
@@ -37,7 +47,7 @@ def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
     """Return means over models of every chaotic family, and Acc by the control's answer."""
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
-    labels = titled(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
+    labels = with_titles(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
     columns = [
         DATASET, Column("sub_scenario", "Sub-scenario"), Column("label", "Ground truth"),
         Column("acc", "Acc %", "percent"),

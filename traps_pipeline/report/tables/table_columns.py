@@ -54,7 +54,7 @@ def marked(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
 
 
-def titled(rows: pd.DataFrame) -> pd.DataFrame:
+def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with `title`, the printed name of the dataset."""
     return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
