@@ -86,11 +86,11 @@ def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
 
 
 class Guard:
-    """An ASGI app before another one.
+    """An ASGI app that guards another one.
 
-    token: the one token, or the person that each of several tokens belongs to; the app finds the person in the scope
-    under WHO. command: what printed the address, in words for who comes without its token. behind: the address of a
-    server with HTTPS that passes requests on, if there is one.
+    token: the only token, or several tokens with the person of each; the app finds the person in the scope under WHO.
+    command: the command that printed the address, for the message to visitors without a token. behind: the address of
+    an HTTPS proxy in front, if there is one.
     """
 
     def __init__(

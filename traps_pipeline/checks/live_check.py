@@ -63,7 +63,7 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class LiveResult:
-    """The result for an entry. problems: what makes its answers worthless; notes: other observations."""
+    """The result for an entry. problems: reasons why its answers are worthless; notes: other observations."""
 
     entry: Entry
     problems: Sequence[str]

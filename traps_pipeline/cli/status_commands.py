@@ -77,7 +77,7 @@ def status(arguments: argparse.Namespace) -> int:
 
 
 def _command(workspace: Workspace, experiment: str | None) -> str:
-    """Return the command that refreshes what is not fresh, for the given experiment or the study's only one."""
+    """Return the command that refreshes stale partitions, for the given experiment or the study's only one."""
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
     names = [name for name in workspace.study.experiments if (EXPERIMENTS / f"{name}.yaml").exists()]

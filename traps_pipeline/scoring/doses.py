@@ -121,9 +121,9 @@ def hypotheses(
 ) -> pd.DataFrame:
     """Return HYPOTHESES rows from the VERDICTS rows of DATASETS_READ.
 
-    There is one row per model, regime, hypothesis and dose, if a dose besides the reference was asked. offered: the
-    number of answers that each item's question offers, by item id. Figures are computed per run, then averaged; their
-    intervals resample scenarios, each with all its doses.
+    There is one row per model, regime, hypothesis and dose, if a dose other than the reference was run. offered: the
+    number of answers to choose from in each item's question, by item id. Figures are computed per run, then averaged;
+    their intervals resample scenarios, each with all its doses.
     """
     items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]

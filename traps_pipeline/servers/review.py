@@ -279,7 +279,7 @@ def _as_json(value: Any) -> Any:
 
 
 def review_app(review: Review) -> FastAPI:
-    """Return the app of a review; it stands behind the guard."""
+    """Return the app of a review, to be placed behind the guard."""
     app = new_app()
 
     @app.get("/")

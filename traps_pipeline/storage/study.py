@@ -44,9 +44,9 @@ class ProbeSettings(BaseModel):
 
 
 class NullSettings(BaseModel):
-    """The null directions against which an effect is ranked.
+    """The null directions against which an effect is ranked: the number of draws of each kind.
 
-    Each kind has so many draws, steered at the largest dose on the datasets that they come from.
+    They are steered at the largest dose on the datasets that they come from.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

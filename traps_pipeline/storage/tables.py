@@ -54,7 +54,7 @@ class StoredColumn:
 
 @dataclass(frozen=True)
 class Beside:
-    """Marks a column: further columns with these suffixes stand beside it, of this type and meaning."""
+    """Marks a column that has further columns beside it, with these suffixes, of this type and meaning."""
 
     suffixes: tuple[str, ...]
     column: Any

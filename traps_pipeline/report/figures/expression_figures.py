@@ -24,13 +24,14 @@ _LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
 
 
 def states_and_output(results: Results) -> Figure:
-    """Return every item by what states and output say of it, both read under the standard VQA prompt. Up: the score of
-    a probe that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the answer begins
-    with an abstention. A filled marker was answered under standard, a hollow one abstained on. Orange filled markers
-    above the line and left of it are encoded and not expressed. Above each panel: how well each orders voids before
-    controls (AUROC), sentences being whole abstentions against the model's own answer, and what noise gives under the
-    same split (mean and two deviations). A gap is one of orders too only where states are above the output by more than
-    that."""
+    """Return every item by its scores from states and from output, both read under the standard VQA prompt. Up: the
+    score of a probe that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the
+    answer begins with an abstention. A filled marker was answered under standard, a hollow one abstained on. Orange
+    filled markers above the line and left of it are encoded and not expressed. Above each panel: how well each score
+    separates voids from controls (AUROC), sentences being whole abstentions against the model's own answer, and the
+    floor of noise under the same split (mean and two deviations). There is a gap in AUROC, too, only if states exceed
+    the output by more than that.
+    """
     rows = scored_items(results)
     if not len(rows):
         raise NotRun(why(results, "the paper prints no scores of items"))
@@ -96,9 +97,10 @@ def _scatter(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def lens(results: Results) -> Figure:
-    """Return mean log-odds of abstaining that the state of each layer gives through the model's own final norm and head
-    (logit lens), of voids (orange) and controls (blue), under both VQA prompts. Where the lines of a side part, the
-    prompt decides; at the last layer they are the output. The dotted line is even odds."""
+    """Return mean log-odds of abstaining from the state of each layer through the model's own final norm and head
+    (logit lens), of voids (orange) and controls (blue), under both VQA prompts. Where the lines of a side separate, the
+    prompt decides; at the last layer they are the output. The dotted line is even odds.
+    """
     rows = results.lens
     if not len(rows):
         raise NotRun(why(results, "the paper has no such curves"))

@@ -20,10 +20,11 @@ _APART = 0.008  # horizontal offset between models, since several abstain and st
 
 def graded(results: Results) -> Figure:
     """Return the share of abstentions under regimes that ask for a decision (left), and the mean probability given to
-    the likeliest answer under regimes that ask for probabilities (right), over cuts whose likeliest answer is about
-    as probable. Grey: an ideal observer, who answers from the probability at which an answer is worth its risk, and
-    states the true one. A step at another place is another threshold; a slope is another knowledge. Models are drawn
-    side by side."""
+    the likeliest answer under regimes that ask for probabilities (right), over cuts with similar probability of the
+    likeliest answer. Grey: an ideal observer, which answers if the probability makes an answer worth its risk, and
+    states the true one. A shifted step means another threshold; another slope means other knowledge. Models are drawn
+    side by side.
+    """
     from matplotlib.lines import Line2D
 
     rows = results.graded

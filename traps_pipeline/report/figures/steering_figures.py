@@ -143,11 +143,12 @@ def _strip(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def dose_response(results: Results) -> Figure:
-    """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along directions
-    of the standard prompt under guided inference if they were run. Directions of the occlusion family are blue, those
-    of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are strong and
-    the others faint. n is the number of answers of a marker. Grey is the mean over the paths with its 95 % interval
-    from resampled scenarios."""
+    """Return abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along
+    directions of the standard prompt under guided inference if they were run. Directions of the occlusion family are
+    blue, those of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are
+    strong and the others faint. n is the number of answers of a marker. Grey is the mean over the paths with its 95 %
+    interval from resampled scenarios.
+    """
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
@@ -222,10 +223,11 @@ def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str
 
 def cosine_heatmaps(results: Results) -> Figure:
     """Return cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one
-    scale of ±0.6. Below the diagonal: of the directions themselves. Above it: without the noise of few pairs and of
-    shared controls, with a star where the 95 % interval excludes 0. On the diagonal: of the directions of two halves of
-    the pairs; where it is low, a small cosine says nothing. A dash is a pair without a figure; the paper has one figure
-    a pair."""
+    scale of ±0.6. Below the diagonal: of the directions themselves. Above it: corrected for the noise of few pairs and
+    of shared controls, with a star if the 95 % interval excludes 0. On the diagonal: of the directions of two halves of
+    the pairs; if it is low, a small cosine is uninformative. A dash is a pair without a figure; the paper has one
+    figure per pair.
+    """
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):

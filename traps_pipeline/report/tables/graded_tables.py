@@ -17,8 +17,9 @@ WHY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
-    """Return what each model is expected to earn on cuts whose answers have known probabilities, and what it loses by
-    not knowing them, by answering too often and by abstaining too often."""
+    """Return the expected points of each model on cuts whose answers have known probabilities, and its losses by
+    ignorance, by rash answers and by needless abstention.
+    """
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]
     shown = {f"{name}_shown": [_figure(row, name) for row in rows.to_dict("records")] for name in ("points", "brier")}
