@@ -63,7 +63,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
         finally:
             part.unlink(missing_ok=True)
     except BrokenPipeError:
-        raise  # of what the block prints to
+        raise  # the reader of the block's output has gone
     except OSError as error:
         if error.filename is not None and str(error.filename) not in map(str, (part, *path.parents)):
             raise

@@ -20,8 +20,8 @@ from traps_pipeline.base.errors import TrapsError
 PROXIES = ("http_proxy", "https_proxy", "all_proxy")  # in small or capital letters
 _READ = tuple(name for low in (*PROXIES, "no_proxy") for name in (low, low.upper()))
 PROXY_SCHEMES = ("http", "https")  # SOCKS takes a package of its own, in every client library
-TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # of calls
-CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # of some library
+TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # read by calls
+CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # read by some library
 
 
 @dataclass(frozen=True)

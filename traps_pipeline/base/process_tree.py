@@ -37,7 +37,7 @@ def split(wait_s: float) -> int | None:
         os.setsid()
         _prctl(_PR_SET_CHILD_SUBREAPER, 1)
         _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:  # it died before the call
+        if os.getppid() != parent:  # the parent died before the call
             raise KeyboardInterrupt
         return None
     try:
@@ -82,7 +82,7 @@ def descendants() -> list[int]:
     """Return the ids of all processes below this one, grandchildren included."""
     children: dict[int, list[int]] = {}
     for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # the process has ended meanwhile
             parent = int((folder / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
             children.setdefault(parent, []).append(int(folder.name))
     below = list(children.get(os.getpid(), ()))

@@ -27,7 +27,7 @@ SHORTEST = 8  # characters: anything shorter could be an ordinary word
 _PIECE = 6
 _NAMES = re.compile(r"(KEY|TOKEN|SECRET|PASSWORD|PASSWD)$", re.IGNORECASE)
 _PASSWORD = re.compile(r"://[^/\s:@]*:([^/\s@]+)@|\bpassword=([^\s&]+)")  # in an address of a database or a proxy
-_EXAMPLE = "PASSWORD"  # as our own sentences write addresses
+_EXAMPLE = "PASSWORD"  # placeholder in our own sentences
 _ENCODED = re.compile(
     r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%(?:25)*[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
     re.IGNORECASE,

@@ -36,7 +36,7 @@ class _Pool:
         self.executor.shutdown(wait=True, cancel_futures=True)
 
 
-_idle: list[_Pool] | None = None  # of `kept_workers`, what nobody uses now
+_idle: list[_Pool] | None = None  # idle pools of `kept_workers`
 
 
 @contextmanager

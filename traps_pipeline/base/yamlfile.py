@@ -73,7 +73,7 @@ _Strict.add_constructor(f"{_TAG}float", _float)
 def _check_events(content: str) -> None:
     """Raise MarkedYAMLError for a tag, and for depth, nodes or aliases by which few lines could stand for millions."""
     nodes = aliases = 0
-    anchors = list[bool]()  # of the collections around an event, whether each has an anchor
+    anchors = list[bool]()  # for each collection around an event: whether it has an anchor
     for event in yaml.parse(content, Loader=_SAFE):
         if isinstance(event, yaml.CollectionEndEvent):
             anchors.pop()

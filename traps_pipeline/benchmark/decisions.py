@@ -75,7 +75,7 @@ def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: boo
     """Return the decisions that restore a scenario's former state, reviewed only if it was."""
     if not is_released:
         if before is None:
-            return [signed("discard")]  # it had been added
+            return [signed("discard")]  # undo an addition
         changes = {**before.words, "params": dict(before.params or {})}
         return [signed("correct", **changes)]
     steps = [signed("restore")]

@@ -124,7 +124,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
     Columns model, from, to, served (names then and now), n (items asked in both), outcome, abstained and value (numbers
     of changed items), tokens (mean change of prompt tokens).
     """
-    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # of each model, in the order of asking
+    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # by model, epochs in order
     for row in rows.sort_values(["model", "created_at"], kind="stable").to_dict("records"):
         by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
     changed = list[dict[str, Any]]()

@@ -45,7 +45,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # a name in the ledger, not a model
-TIMEOUT_S, REACH_S = 25.0, 5.0  # of a call, and of the checks before it: problems show within half a minute
+TIMEOUT_S, REACH_S = 25.0, 5.0  # time-outs of a call and of earlier checks
 BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"

@@ -44,7 +44,7 @@ def ui(arguments: argparse.Namespace) -> int:
 
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
         if value is not None:
-            os.environ[variable] = str(value)  # for the daemon, which starts such runs
+            os.environ[variable] = str(value)  # read by the daemon, which starts such runs
     try:
         workspace = open_workspace(arguments)
         with dagster_history(workspace):

@@ -39,7 +39,7 @@ _OBJECTS = sa.Table(
     sa.Column("digest", sa.LargeBinary),  # null: the name was removed
     sa.Column("size", sa.BigInteger),
     sa.Column("note", sa.Text),
-    sa.Column("number", sa.BigInteger, nullable=False),  # of the change
+    sa.Column("number", sa.BigInteger, nullable=False),  # number of the change
     sa.Column("at", sa.DateTime(timezone=True), nullable=False, server_default=sa.func.clock_timestamp()),
     sa.Index("traps_objects_number", "study", "number"),
 )

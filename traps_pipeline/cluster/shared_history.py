@@ -38,7 +38,7 @@ def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
             "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1}},
         },
         "compute_logs": {
-            "module": "dagster._core.storage.local_compute_log_manager",  # as Dagster's documentation has it
+            "module": "dagster._core.storage.local_compute_log_manager",  # as in Dagster's documentation
             "class": "LocalComputeLogManager",
             "config": {"base_dir": {"env": LOGS}},
         },

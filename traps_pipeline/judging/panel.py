@@ -136,7 +136,7 @@ class AbstentionVote(BaseModel):
     abstained: Flag
     confidence: Confidence
     reasoning: str
-    rejects_premise: Flag | None = None  # of judges that are asked for it
+    rejects_premise: Flag | None = None  # only for judges that are asked for it
 
 
 class CorrectnessVote(BaseModel):

@@ -20,10 +20,10 @@ REACHED = 0.4  # share of a card's operations that passes over prompts reach
 STEP_S = 0.7e-3  # per block and decoding step, for any number of rows
 NF4_TIMES = 2.0  # factor on time, since weights are unpacked at every use
 NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # per parameter
-ROWS = 64  # of a batch of answers
+ROWS = 64  # rows of a batch of answers
 WIDEST = 28  # numbers per token and unit of width at a block's peak
 GRAPH = 18  # numbers per token, block and unit of width that a backward pass keeps
-SOURCES = 4  # of a patch: the other side, and three nulls
+SOURCES = 4  # sources of patches: the other side, and three nulls
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quan
     weights = parameters * (NF4_BYTES if quantised else BFLOAT16_BYTES)
     seconds = 2 * parameters * tokens_in / (REACHED * card.operations)
     seconds += tokens_out / ROWS * max(layers * STEP_S, weights / card.bandwidth)
-    state = prompt * width * BFLOAT16_BYTES  # of one layer
+    state = prompt * width * BFLOAT16_BYTES  # bytes of one layer
     extra = (4 * layers + 2 + GRAPH * layers) * state if work.kind == "patching" else WIDEST * state
     return Cost(
         entry.id, work.kind, passes, tokens_in, tokens_out,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["model", "directions", "regime"]
-BESIDE = ("n", "gaps", "broken")  # of an effect: answers, dose in class gaps, share of degenerate ones
+BESIDE = ("n", "gaps", "broken")  # answers, dose in class gaps, share of degenerate answers
 REGIME_COLUMNS = (
     *("model", "path_set", "family", "directions", "regime", "kind", "n_paths", "alpha"),
     *("control_0", "control_top", "void_0", "void_top"),

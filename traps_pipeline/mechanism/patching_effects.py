@@ -318,7 +318,7 @@ def _replacing(
         own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
         if own is not None and behind is not None:
             args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
-        shared = argument_of(block, SHARED, args, kwargs)  # one mapping, which all blocks are given
+        shared = argument_of(block, SHARED, args, kwargs)  # one mapping, shared by all blocks
         if shared is not None and below == start:
             for name, (maker, *pair) in target.shared.items():
                 if maker <= start:
@@ -337,7 +337,7 @@ def _replacing(
         for below, block in enumerate(blocks[start:], start=start):
             hooks.callback(block.register_forward_pre_hook(partial(beside, below), with_kwargs=True).remove)
         for layer, block in enumerate(blocks[:start], start=1):
-            own = vars(block).get("forward")  # of a model that accelerate spreads over devices
+            own = vars(block).get("forward")  # set by accelerate on a model that is spread over devices
             block.forward = partial(skip, layer)
             hooks.callback(
                 partial(vars(block).pop, "forward") if own is None else partial(setattr, block, "forward", own)

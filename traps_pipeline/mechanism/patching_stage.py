@@ -127,7 +127,7 @@ class Pairs:
         best = best_cells(estimates, self._settings, self._model.n_layers)
         patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
         store = self._workspace.store
-        store.remove({*store.below(self._folder)} - paths)  # of other settings or items
+        store.remove({*store.below(self._folder)} - paths)  # files of other settings or items
         return estimates, patches
 
     def _each(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:

@@ -7,7 +7,7 @@ from traps_pipeline.video.policies import FramePolicy
 
 _RATES = {"frames_few": 2, "frames_all": 10}  # frames a second
 _LATER = {"frames_later": 1}  # frames of the clip
-CLIP_S = 5  # of a whole clip (docs/spec.md 2)
+CLIP_S = 5  # duration of a whole clip (docs/spec.md 2)
 
 
 def media_for_dataset(spec: MediaSpec, dataset: str) -> MediaSpec:

@@ -123,7 +123,7 @@ class ParticipantStopped(TrapsError):
     """A participant that is no longer asked; the others go on."""
 
 
-_stopped: list[dict[str, str]] = []  # of each active `remembering_stops`: participant to message
+_stopped: list[dict[str, str]] = []  # one per active `remembering_stops`: participant to message
 
 
 @contextmanager

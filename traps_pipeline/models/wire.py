@@ -25,7 +25,7 @@ from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, prox
 from traps_pipeline.models.transport import Exchange, watching
 
 MOST_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
-CONNECT_S = 60.0  # for a connection with its TLS handshake
+CONNECT_S = 60.0  # time-out of a connection with its TLS handshake
 KEEPALIVE_S, NAMES_KEPT_S = 120.0, 300  # an idle connection; an address of a name
 _ASKED_ANEW = ("content-encoding", "content-length", "transfer-encoding", "location")
 

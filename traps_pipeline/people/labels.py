@@ -29,7 +29,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace
 
-MOST_CHARACTERS = 200  # of an answer
+MOST_CHARACTERS = 200  # limit of an answer
 DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
     "answerability": ("abstained",),
     "confabulation": AXES,

@@ -22,7 +22,7 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from traps_pipeline.base.databases import reason_and_remedy
 
 OPEN_FILES = 32  # at most: each run has a file of its own, and a server sees many
-_BUSY_S = 30  # for another process's lock, as Dagster itself waits
+_BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
 class HistoryUnwritable(OperationalError):

@@ -99,7 +99,7 @@ class Experiment(BaseModel):
 
     @model_validator(mode="after")
     def _study_holds_together(self) -> Experiment:
-        _ = self.study  # so that a study that would be invalid (two subsets, a wrong epoch) is an error of this file
+        _ = self.study  # report an invalid study (two subsets, a wrong epoch) as an error of this file
         return self
 
     @property

@@ -121,6 +121,6 @@ def _preflight(workspace: Workspace, participants: _Participants, say: Callable[
 
     checks = preflight(workspace, models, participants.judges)
     for check in checks:
-        if not check.problems:  # they are what is raised
+        if not check.problems:  # they are raised instead
             say(check.line)
     require_sound(checks)

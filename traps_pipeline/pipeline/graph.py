@@ -225,7 +225,7 @@ class Graph:
         """Return every partition upstream of one, existing or not, by stage or source."""
         scheme = self.declared[name].scheme
         if key is not None and (scheme is None or key not in scheme.known):
-            return {}  # of an experiment that was removed from the study
+            return {}  # a key of an experiment that was removed from the study
         return {
             parent.name: [None] if (above := self.declared[parent.name].scheme) is None
             else self.mapping(name, parent.name).above(key, scheme, above)

@@ -22,9 +22,9 @@ from traps_pipeline.base.paths import user_cache
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 
-NOTES = "inputs.json"  # of the archive: the digest of each piece's inputs
+NOTES = "inputs.json"  # archive member with the digest of each piece's inputs
 _DRAWN_BY = ("matplotlib", "pandas", "jinja2")  # libraries whose versions decide what a piece looks like
-_DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same pieces are the same bytes
+_DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give equal bytes
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from urllib.parse import quote
 if TYPE_CHECKING:
     import pandas as pd
 
-STUDY_URL = "/study"  # where `traps ui` serves the study's report, site and clips
+STUDY_URL = "/study"  # route of `traps ui` to the study's report, site and clips
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
                     instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
             yield instance
     except BrokenPipeError:
-        raise  # of what is printed to
+        raise  # the reader of the output has gone
     except Exception as error:
         cause = database_error(error)
         if isinstance(error, OSError):
@@ -86,7 +86,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         try:
             instance = _instance(home, is_captured=workspace.is_on_cluster)
             instance.get_runs_count()
-            instance.all_asset_keys()  # of the other file
+            instance.all_asset_keys()  # read the other file
         except OperationalError:
             raise  # a full disk or another process's lock: the history is intact
         except DatabaseError as error:

@@ -19,7 +19,7 @@ from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
 
 _NOTE = "last_run.json"
-_HISTORY = Path("history", "runs", "index.db")  # of Dagster's SQLite storage, below its folder; holds every event
+_HISTORY = Path("history", "runs", "index.db")  # all events of Dagster's SQLite storage, below its folder
 
 
 def stages_until(until: str | None) -> set[str]:
@@ -76,7 +76,7 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
         for key in graph[name].wanted(partitions)
     }
     former = _read_note(workspace)
-    if former.get("history") == history:  # of other stages or another experiment: Dagster holds these too
+    if former.get("history") == history:  # keep versions of other stages or experiments
         versions = former["versions"] | versions
     note = json.dumps({"history": history, "versions": versions})
     workspace.store.write({workspace.dagster_home / _NOTE: note.encode()})

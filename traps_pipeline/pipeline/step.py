@@ -160,7 +160,7 @@ class _Step:
         """
         for name in self.context.op_def.output_dict:
             if name != "result":
-                yield dg.Output(None, output_name=name)  # of a check
+                yield dg.Output(None, output_name=name)  # output of a check
         yield result or dg.MaterializeResult(metadata={SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION: True})
 
     def stages_below(self) -> set[str]:

@@ -51,7 +51,7 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
 WRONG_COSTS = 3
 ANSWER_FROM = WRONG_COSTS / (1 + WRONG_COSTS)  # the probability of being right from which an answer is worth its risk
 REGIMES = tuple(BY_NAME)
-PAPER_REGIMES = ("standard", "guided", "json")  # what the paper asks, and an experiment that names no regimes
+PAPER_REGIMES = ("standard", "guided", "json")  # the paper's, and the default of an experiment
 VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)
 # The paper compares answers under these two: the plain prompt, and the one that permits an abstention.
 STANDARD, GUIDED = PROMPTING = ("standard", "guided")

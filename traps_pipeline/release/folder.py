@@ -33,7 +33,7 @@ from traps_pipeline.release.released_rows import (
 )
 from traps_pipeline.storage.tables import Table
 
-FORMAT = 1  # of a released folder
+FORMAT = 1  # version of the released folder's format
 MANIFEST, COMMITMENT, CROISSANT = "release.json", "commitment.json", "croissant.json"
 CARD, DICTIONARY, CITATION = "README.md", "DICTIONARY.md", "CITATION.cff"
 LICENCE, PROMPTS_LICENCE = "LICENSE-DATA", "LICENSE-PROMPTS"

@@ -29,7 +29,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
 OURS = "traps-pipeline"  # developer of the reference models
-EVER_SCHEMA = "0.3.0"  # of Every Eval Ever
+EVER_SCHEMA = "0.3.0"  # schema version of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
 Row = Mapping[str, Any]

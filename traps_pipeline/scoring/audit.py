@@ -197,7 +197,7 @@ def pecs_factors() -> Iterator[AuditFinding]:
 
 
 def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
-    half = 0.0005  # of a printed 0.1 %
+    half = 0.0005  # half the last digit of a printed 0.1 %
     deviation = {name: float(cell[f"{name}_std"]) + half for name in ("acc", "abs_rec", "false_abs")}
     if not (cell["acc_std"] or cell["abs_rec_std"] or cell["false_abs_std"]):  # a single run has no deviation
         deviation = dict.fromkeys(deviation, 0.0)

@@ -32,9 +32,9 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epoch
 from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
 
 VISUAL = ("occlusion", "chaotic")
-RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by one cue alone
+RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by a single cue
 SHOWN = ("acc", "false_abs", "abs_rec", "j")
-_SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # of `with_unseen`
+_SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # columns of `with_unseen`
 _CHANGE = (-2.0, 2.0)  # the limits of a change of J
 _KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 

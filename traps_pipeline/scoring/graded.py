@@ -22,7 +22,7 @@ from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Resampling, draw_s
 from traps_pipeline.scoring.metrics import joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import GRADED_CUTS
 
-SCOPES = (0.0, 0.45, 0.6, ANSWER_FROM, 0.9)  # where ranges of the commonest answer's probability begin
+SCOPES = (0.0, 0.45, 0.6, ANSWER_FROM, 0.9)  # lower ends of ranges of the commonest answer's probability
 SUM_WITHIN = 0.05  # allowed deviation of a sum of probabilities from 1
 WITH_INTERVAL = {"points": (-WRONG_COSTS, 1.0), "regret": (0.0, 1.0 + WRONG_COSTS), "brier": (0.0, 2.0)}  # their limits
 PARTS = ("regret_label", "regret_rash", "regret_shy")

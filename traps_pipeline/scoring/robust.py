@@ -39,7 +39,7 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epoch
 from traps_pipeline.scoring.score_rows import ROBUST
 
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
-CONJUNCTION = ("control", "void", f"{TWIN} control", f"{CROSSED} control", f"{CROSSED} void")  # of one scenario
+CONJUNCTION = ("control", "void", f"{TWIN} control", f"{CROSSED} control", f"{CROSSED} void")  # items of one scenario
 FULL_KIND = 30  # items; a kind with fewer weighs proportionally less
 WITH_INTERVAL = ("robust", "conjunction")
 _ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]

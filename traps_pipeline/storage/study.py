@@ -11,7 +11,7 @@ from traps_pipeline.protocol.datasets import is_ill_posed
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, VQA_PROMPTS
 from traps_pipeline.storage.media import MediaSpec
 
-FORMAT = 1  # of a workspace
+FORMAT = 1  # version of a workspace's format
 Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 VARIABLE = "TRAPS_WORKSPACE"
 RAY = "TRAPS_RAY"  # environment variable: the address of Ray's head, http://HEAD:8265
-RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # of cluster runs that Dagster's pages launch
+RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # for cluster runs that Dagster's pages launch
 DATABASE = "TRAPS_DATABASE"  # default variable for the database's address of a new study in a store
 
 

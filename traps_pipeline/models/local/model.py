@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-CLOCK_FPS = 1000  # of the time stamps given to processors: milliseconds, as exact as a frame number at any rate
+CLOCK_FPS = 1000  # resolution of time stamps for processors: milliseconds
 MEMORY_SHARE = 0.7  # share of free memory for a batch, by estimate
 
 
@@ -64,7 +64,7 @@ class LocalModel:
         self.network, self.processor, self.checkpoint, self.params, self.device = (
             network, processor, checkpoint, params, device,
         )  # fmt: skip
-        self.inputs_device = str(network.device) if device == SPREAD else device  # of the embeddings
+        self.inputs_device = str(network.device) if device == SPREAD else device  # device of the embeddings
         self.dtype, self.quantisation = params.dtype, params.quantisation
         self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
         self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)

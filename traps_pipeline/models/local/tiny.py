@@ -196,7 +196,7 @@ def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: O
     words = {
         **base,
         "vocab_size_per_layer_input": base["vocab_size"],
-        "hidden_size_per_layer_input": 64,  # of 64: what NF4 needs on a CPU
+        "hidden_size_per_layer_input": 64,  # a multiple of 64, as NF4 needs on a CPU
         "global_head_dim": 32,
         "num_hidden_layers": 6,
         "num_kv_shared_layers": 2,

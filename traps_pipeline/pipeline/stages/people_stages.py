@@ -68,7 +68,7 @@ def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
 def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return all HUMAN_LABELS rows, and the VERDICTS rows of the study's panel."""
     labels = workspace.tables.read(HUMAN_LABELS, {})
-    judged = current_rows(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # they are many
+    judged = current_rows(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # verdicts are many
     own = judged.loc[judged["panel"] == panel_id(workspace.study.panel)]
     return labels, own.reset_index(drop=True)
 

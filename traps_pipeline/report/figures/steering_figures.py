@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
 LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
 MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
-FAMILY_COLOUR = {"occlusion": "#0072B2", "chaotic": "#C8102E"}  # of directions, in dose and response
+FAMILY_COLOUR = {"occlusion": "#0072B2", "chaotic": "#C8102E"}  # colours of directions in dose and response
 # The paper draws four key paths and does not name them. These cross the domains onto visual voids.
 KEY_PATHS = [(s, t) for s, t in TRANSFER if taxonomy_of(s) != taxonomy_of(t) and not is_ill_posed(t)]
-COSINE_SCALE = 0.6  # of the paper's heatmaps
+COSINE_SCALE = 0.6  # scale of the paper's heatmaps
 CROSSING = TRANSFER_TYPES[:3]
 SETS = {"transfer": "transfer", "within_domain": "within"}
 
