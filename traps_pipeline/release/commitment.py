@@ -38,9 +38,10 @@ class _Strict(BaseModel):
 
 
 class Commitment(_Strict):
-    """The public file. draws: scenarios by family. seed: digest of the seed. specs: digest of each record.
+    """The public file.
 
-    made_with: machine and libraries, which may affect the arithmetic of a draw.
+    draws: scenarios by family. look: the varied parts of the look, by family. seed: digest of the seed. specs: digest
+    of each record. made_with: machine and libraries, which may affect the arithmetic of a draw.
     """
 
     format: Literal[1] = 1
@@ -48,6 +49,7 @@ class Commitment(_Strict):
     version: str
     canary: str
     draws: dict[str, int]
+    look: dict[str, list[str]] = {}
     seed: str = Field(pattern=_HEX)
     specs: dict[str, str] = Field(min_length=1)
     made_with: dict[str, str]
@@ -89,6 +91,7 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     published = Commitment(
         **release.model_dump(include={"name", "version", "canary"}),
         draws=draws,
+        look={name: tally.look for name, tally in sorted(tallies.items())},
         seed=_sealed_seed(secret, draws),
         specs={id_: _sealed_spec(secret, spec) for id_, spec in sorted(specs.items())},
         made_with=_made_with(),
@@ -182,7 +185,15 @@ def drawn_again(
             for family, count in commitment.draws.items():
                 report(f"drawing {count} of {family} again")
                 try:
-                    sample_family(family, count, reveal.seed, Path(folder) / "released", workers=workers, report=report)
+                    sample_family(
+                        family,
+                        count,
+                        reveal.seed,
+                        Path(folder) / "released",
+                        look=commitment.look.get(family, ()),
+                        workers=workers,
+                        report=report,
+                    )
                 except (RuntimeError, KeyError) as error:
                     raise TrapsError(
                         f"{family}: the seed does not give {count} scenarios here ({plain(error)})"
