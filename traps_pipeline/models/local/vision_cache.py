@@ -38,7 +38,10 @@ class _Features:
 
 @dataclass(eq=False)
 class ClipMemory:
-    """An LRU cache of features by clip. passes: clips through the vision tower; used: cache hits."""
+    """A bounded cache of features by clip, oldest evicted first.
+
+    passes: number of clips through the vision tower; used: number of cache hits.
+    """
 
     most_bytes: int = MOST_BYTES
     passes: int = 0
