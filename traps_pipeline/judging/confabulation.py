@@ -146,10 +146,7 @@ def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -
 
 
 def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
-    """Return a model's sample by cell.
-
-    It is empty, with a note, until every dataset of the study that has items has verdicts.
-    """
+    """Return a model's sample by cell; empty, with a note, while a dataset with items lacks verdicts."""
     protocol = load_protocol()
     cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     lacking = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]

@@ -65,7 +65,7 @@ class Strength:
     dose: float = 0.0
     signs: str = BY_LABEL
 
-    def signed(self, side: str) -> float:
+    def signed_alpha(self, side: str) -> float:
         """Return the signed alpha of a side."""
         return sign_of(self.signs, side) * self.alpha
 
@@ -240,7 +240,7 @@ def steered_request(
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
     if strength.alpha:
-        signed = strength.signed(item["side"])
+        signed = strength.signed_alpha(item["side"])
         steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
     return Request(
         participant=entry.id,

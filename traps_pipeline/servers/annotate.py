@@ -27,7 +27,7 @@ from traps_pipeline.people.labels import LABELS
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.servers.labelstore import LabelStore, NotWaiting
-from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -117,15 +117,15 @@ class Annotation:
         return unit
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
-        """Return the task and unit of a handle that was given to this person. Raises NotThere."""
+        """Return the task and unit of a handle that was given to this person. Raises NotFound."""
         for each in self.store.shown(who):
             task = require_task(each.task)
             if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
                 return task, each.unit
-        raise NotThere("nothing of this name is shown to you")
+        raise NotFound("nothing of this name is shown to you")
 
     def record(self, who: str, sent: Sent) -> None:
-        """Store a label. Raises NotThere, Refused and Conflict."""
+        """Store a label. Raises NotFound, Refused and Conflict."""
         task, unit = self.find(who, sent.handle)
         try:
             label = LABELS[task].model_validate(sent.label)
@@ -137,18 +137,18 @@ class Annotation:
             raise Conflict(str(error)) from error
 
     def reopen(self, who: str, name: str) -> None:
-        """Show the last labelled unit of a task again. Raises NotThere without one."""
+        """Show the last labelled unit of a task again. Raises NotFound without one."""
         task = require_task(name)
         known = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
         if not known:
-            raise NotThere("you have labelled nothing here yet")
+            raise NotFound("you have labelled nothing here yet")
         self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
-        """Return the clip behind a handle. Raises NotThere."""
+        """Return the clip behind a handle. Raises NotFound."""
         task, unit = self.find(who, handle)
         if task != "answerability":
-            raise NotThere("nothing of this name is shown to you")
+            raise NotFound("nothing of this name is shown to you")
         return study_file(self.workspace, self.items[str(self.samples[task].loc[unit, "item_id"])]["clip"])
 
     def shown(self, who: str, task: TaskName, unit: str) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def annotation_app(annotation: Annotation) -> FastAPI:
     @app.get("/task/{name}")
     def unit(request: Request, name: str) -> Response:
         if name not in TASKS:
-            raise NotThere(f"{name}: no task of this name")
+            raise NotFound(f"{name}: no task of this name")
         return HTMLResponse(annotation.unit_page(who(request), require_task(name)))
 
     @app.get("/clip/{handle}")

@@ -46,7 +46,7 @@ CREATE INDEX IF NOT EXISTS labels_of_a_person ON labels (who, task);
 
 
 class NotWaiting(TrapsError):
-    """A label of a unit that waits for none, for instance because it was labelled in another window."""
+    """The labelled unit waits for no label, for instance because it was labelled in another window."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from traps_pipeline.report.explorer.scenario_words import answer_of_control, cer
 from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
 from traps_pipeline.servers.duplicates import Comparison
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
-from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -110,9 +110,9 @@ class Review:
         return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
-        """Return the row of a scenario. Raises NotThere."""
+        """Return the row of a scenario. Raises NotFound."""
         if scenario_id not in self.specs:
-            raise NotThere(f"{scenario_id}: not a scenario of this study")
+            raise NotFound(f"{scenario_id}: not a scenario of this study")
         return self.specs[scenario_id]
 
     def reviewed(self) -> frozenset[str]:
@@ -126,7 +126,7 @@ class Review:
         return queue(name, list(self.specs), self.reviewed(), self.flags, alike)
 
     def decide(self, sent: Decision) -> None:
-        """Append a decision. Raises NotThere, Refused and Conflict."""
+        """Append a decision. Raises NotFound, Refused and Conflict."""
         spec = self.spec(sent.scenario_id)
         correction, seen = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":
@@ -144,7 +144,7 @@ class Review:
         return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
 
     def undo(self, sent: Undo) -> None:
-        """Take back the last decision. Raises NotThere, Refused and Conflict."""
+        """Take back the last decision. Raises NotFound, Refused and Conflict."""
         self.spec(sent.scenario_id)
         try:
             undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
@@ -152,7 +152,7 @@ class Review:
             raise Conflict(str(error)) from error
 
     def preview(self, sent: Preview) -> dict[str, Any]:
-        """Return the words after the changes, and the cost of asking again. Raises NotThere and Refused."""
+        """Return the words after the changes, and the cost of asking again. Raises NotFound and Refused."""
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
         cost = correction_effect(self.workspace, spec, correction)
@@ -248,7 +248,7 @@ class Review:
         return [f"traps status {target}", f"traps run {target}"]
 
     def strip(self, scenario_id: str) -> bytes:
-        """Return frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
+        """Return frames of the control above the void's at the same times, as JPEG. Raises NotFound."""
         import cv2
 
         from traps_pipeline.video.encode import decode
@@ -267,10 +267,10 @@ class Review:
         return jpeg.tobytes()
 
     def clip(self, scenario_id: str, side: str) -> Path:
-        """Return the file of a clip. Raises NotThere if the study has none."""
+        """Return the file of a clip. Raises NotFound if the study has none."""
         row = self.clips.get((scenario_id, side))
         if row is None:
-            raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
+            raise NotFound(f"{scenario_id}: the study has no {side} clip of it")
         return study_file(self.workspace, row["path"])
 
 

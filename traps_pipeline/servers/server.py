@@ -28,7 +28,7 @@ from traps_pipeline.storage.workspace import Workspace
 WEB = Path(__file__).parent / "web"
 
 
-class NotThere(TrapsError):
+class NotFound(TrapsError):
     """The study has nothing of this name (404)."""
 
 
@@ -46,7 +46,7 @@ def new_app() -> FastAPI:
 
     @app.exception_handler(TrapsError)
     async def said(request: Request, error: TrapsError) -> Response:
-        status = 404 if isinstance(error, NotThere) else 409 if isinstance(error, Conflict) else 400
+        status = 404 if isinstance(error, NotFound) else 409 if isinstance(error, Conflict) else 400
         return JSONResponse({"error": str(error)}, status)
 
     @app.exception_handler(RequestValidationError)
@@ -73,11 +73,11 @@ def script(*names: str) -> str:
 
 
 def study_file(workspace: Workspace, relative: str) -> Path:
-    """Return a clip that a table of the study names. Raises NotThere for any other path."""
+    """Return a clip that a table of the study names. Raises NotFound for any other path."""
     path = workspace.resolve(relative)
     inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
     if not inside or not path.is_file():
-        raise NotThere("the study has no such clip")
+        raise NotFound("the study has no such clip")
     return path
 
 
