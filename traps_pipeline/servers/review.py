@@ -231,7 +231,7 @@ class Review:
         """Return the page at the end of a queue: the decisions' effect, and the commands that follow."""
         return page(
             "review_done.html.j2",
-            correction_effect=self.summary(),
+            effect=self.summary(),
             queue=name,
             comparing=self.comparison.progress if name == "alike" else "",
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
