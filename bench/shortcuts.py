@@ -31,7 +31,7 @@ import pandas as pd
 
 from bench.quick import parse
 from traps_pipeline.base.paths import RELEASED
-from traps_pipeline.benchmark.foretelling import foretold
+from traps_pipeline.benchmark.outcome_leakage import outcome_leakage
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.certification.certificates import CLOSING, REFERENTS, Certificate, stored_evidence
 from traps_pipeline.scenes.certification.certify_record import state_at_cut
@@ -239,7 +239,7 @@ def print_states(found: Sequence[Measured]) -> None:
     print("\nOutcome predicted from the state at the cut (best of two readers, commonest outcome, difference, of)")
     for family, ones in sorted(by_family(found).items()):
         states = [one.at_cut for one in ones if one.at_cut is not None]
-        told = foretold(states, [one.truth for one in ones]) if states else None
+        told = outcome_leakage(states, [one.truth for one in ones]) if states else None
         if told is not None:
             print(f"  {family:20} {told.best:6.3f} {told.prior:6.3f} {told.gain:+6.3f} {len(ones):4d}")
 

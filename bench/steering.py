@@ -30,13 +30,13 @@ import numpy as np
 from bench.quick import parse
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local.adapter import Generated, LocalModel, load_local_model
+from traps_pipeline.models.local.adapter import GeneratedAnswer, LocalModel, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.local.vision_cache import ClipMemory
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
-from traps_pipeline.storage.media import MediaSpec, pick, resized
+from traps_pipeline.storage.media import MediaSpec, pick, resize
 
 T = TypeVar("T")
 ALPHAS, NEW_TOKENS = (-40.0, 5.0, 40.0), 24
@@ -85,25 +85,25 @@ def measure(entry: ModelEntry, chosen: argparse.Namespace) -> None:
     for number in range(chosen.prompts):
         frames = rng.integers(0, 256, (len(times), HEIGHT, WIDTH, 3), dtype=np.uint8)
         asked = f"Does the ball end up left or right of the wall, in clip {number}?"
-        prompts.append(model.prompt(system_prompt("standard"), asked, resized(frames, spec.size), times))
+        prompts.append(model.prompt(system_prompt("standard"), asked, resize(frames, spec.size), times))
     drawn = rng.normal(size=(chosen.directions, model.d_model))
     vectors = (drawn / np.linalg.norm(drawn, axis=1, keepdims=True)).astype(np.float32)
     layer = chosen.layer or max(1, round(model.n_layers * 5 / 9))
     sheet = [*product(range(len(prompts)), range(len(vectors)), ALPHAS)]
 
-    def plain() -> list[Generated]:
-        answers = list[list[Generated]]()
+    def plain() -> list[GeneratedAnswer]:
+        answers = list[list[GeneratedAnswer]]()
         for direction, alpha in product(range(len(vectors)), ALPHAS):
             hook = Steering(vectors[direction], layer, (alpha,) * len(prompts))
             answers.append(model.generate(prompts, NEW_TOKENS, steering=hook))
         return [row[number] for number in range(len(prompts)) for row in answers]
 
-    def shipped() -> list[Generated]:
+    def shipped() -> list[GeneratedAnswer]:
         answers = []
         for start in range(0, len(sheet), ROWS):
             rows = sheet[start : start + ROWS]
             along, alphas = vectors[[d for _, d, _ in rows]], tuple(alpha for _, _, alpha in rows)
-            with model.remembering_clips():
+            with model.caching_clips():
                 of = [prompts[number] for number, _, _ in rows]
                 answers += model.generate(of, NEW_TOKENS, steering=Steering(along, layer, alphas))
         return answers
@@ -128,7 +128,7 @@ def extraction(model: LocalModel, spec: MediaSpec, device: str | None, clips: in
     rng, times = np.random.default_rng(1), CLIP_S[pick(CLIP_S, spec)]
     prompts = []
     for _ in range(clips):
-        frames = resized(rng.integers(0, 256, (len(times), HEIGHT, WIDTH, 3), dtype=np.uint8), spec.size)
+        frames = resize(rng.integers(0, 256, (len(times), HEIGHT, WIDTH, 3), dtype=np.uint8), spec.size)
         asked = ("Does the ball end up left or right?", "What does the ball weigh?")
         prompts += [model.prompt(vqa_prompt(name), q, frames, times) for name in ("standard", "guided") for q in asked]
 
@@ -137,7 +137,7 @@ def extraction(model: LocalModel, spec: MediaSpec, device: str | None, clips: in
 
     def remembering() -> list[np.ndarray]:
         model.clips = ClipMemory()
-        with model.remembering_clips():
+        with model.caching_clips():
             return plain()
 
     (old, theirs), (new, ours) = _timed(plain, device), _timed(remembering, device)

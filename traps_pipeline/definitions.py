@@ -1,4 +1,4 @@
-"""The code location: `dagster ... -m traps_pipeline.definitions`."""
+"""The code location of Dagster: `dagster ... -m traps_pipeline.definitions`."""
 
 import dagster as dg
 
@@ -20,7 +20,7 @@ def _sensors() -> list[dg.SensorDefinition]:
     return [*sensors(), *(several_hosts().sensors() if workspace is not None and workspace.is_on_cluster else ())]
 
 
-# Runs are in process: a run costs 2 s instead of 5, and rendering and calls use their own processes and connections.
+# Runs execute in process: 2 s per run instead of 5, and rendering and calls have their own processes and connections.
 defs = dg.Definitions(
     assets=assets_of(the_graph()),
     jobs=jobs(),

@@ -23,15 +23,15 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.mechanism.deciding import Gate, Threshold, fitted_gate
 from traps_pipeline.mechanism.hook import Site, changing
-from traps_pipeline.mechanism.other_probes import erased as erased
+from traps_pipeline.mechanism.live_gate import Gate, Threshold, fitted_gate
+from traps_pipeline.mechanism.other_probes import erase_side as erase_side
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stages import saved_directions
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.regimes import REGIMES
@@ -53,10 +53,12 @@ def _workspace(where: Where) -> Workspace:
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
-    """States with what belongs to them. X: (n, d) float32. items: n rows with item_id, dataset, scenario_id, side,
-    sub_scenario, void, and for each regime with verdicts abstained_REGIME and correct_REGIME (null where there is
-    none)."""
+class LoadedStates:
+    """States with their items and verdicts.
+
+    X: (n, d) float32. items: n rows with item_id, dataset, scenario_id, side, sub_scenario, void, and for each regime
+    with verdicts abstained_REGIME and correct_REGIME (null if there is none).
+    """
 
     X: np.ndarray
     items: pd.DataFrame
@@ -66,11 +68,11 @@ class Loaded:
         """Whether each item is a void, (n,) bool."""
         return self.items["void"].to_numpy(bool)
 
-    def where(self, chosen: Any) -> Loaded:
-        """Return the items that a mask (n,) or a query on `items` chooses."""
+    def where(self, chosen: Any) -> LoadedStates:
+        """Return the items that a mask (n,) or a query on `items` selects."""
         mask = self.items.eval(chosen) if isinstance(chosen, str) else chosen
         mask = np.asarray(mask, bool)
-        return Loaded(self.X[mask], self.items.loc[mask].reset_index(drop=True))
+        return LoadedStates(self.X[mask], self.items.loc[mask].reset_index(drop=True))
 
 
 def load(
@@ -80,11 +82,13 @@ def load(
     layer: int | Literal["normed"],
     prompt: str = "standard",
     datasets: Sequence[str] | None = None,
-) -> Loaded:
-    """Return the states of a study's items at one layer (0: embeddings; `normed`: the last one after the final norm),
-    joined with the verdicts of run 1. datasets: some of those that have states; all by default.
+) -> LoadedStates:
+    """Return the states of a study's items at one layer, joined with the verdicts of run 1.
 
-    Raises TrapsError when the study has no such states, model, layer or dataset.
+    layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
+    default.
+
+    Raises TrapsError if the study has no such states, model, layer or dataset.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
@@ -105,7 +109,7 @@ def load(
         parts.append(items)
         vectors.append(states.read(dataset, layer))
     joined = pd.concat(parts, ignore_index=True)
-    return Loaded(np.concatenate(vectors), joined.dropna(axis=1, how="all"))
+    return LoadedStates(np.concatenate(vectors), joined.dropna(axis=1, how="all"))
 
 
 def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
@@ -129,15 +133,14 @@ def protocol(
     fit: Fit = fit_probe,
     prompt: str = "standard",
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
-    features: Loaded | None = None,
+    features: LoadedStates | None = None,
 ) -> pd.DataFrame:
-    """Return the study's own protocol for another probe: the rows that the table `probe_baselines` has for its
-    baselines, with the same items, folds, splits by scenario and intervals.
+    """Run the study's own protocol with another probe; return rows like those of `probe_baselines`.
 
-    fit: states (n, d) and void (n,) to anything with `scores` (`from_sklearn`, `mean_difference`, your own). change: a
-    change of the states of a dataset, (n, d) to (n, k). features: what items have in the place of the study's states;
-    datasets that it lacks are left out. Columns:
-    analysis, source, target, value (AUROC), low, high, n_voids, n_controls.
+    They have the same items, folds, splits by scenario and intervals as the study's. fit: maps states (n, d) and void
+    (n,) to an object with `scores` (`from_sklearn`, `mean_difference`, your own). change: transforms the states of a
+    dataset, (n, d) to (n, k). features: used instead of the study's states; datasets without features are left out.
+    Columns: analysis, source, target, value (AUROC), low, high, n_voids, n_controls.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
@@ -175,14 +178,13 @@ def gate(
     prompt: str = "standard",
     without: Collection[str] = (),
 ) -> Gate:
-    """Return a gate that decides now: `abstains(model, prompt)` and `answer(model, prompt)` for a model and prompt of
-    ours.
+    """Return a gate for live use: `abstains(model, prompt)` and `answer(model, prompt)`, for a local model and its
+    prompt.
 
     source: `one:DATASET`, `other datasets` (than the target) or `other families`. threshold: mid, J or conformal.
-    layer: that of the gate stage by default. without: scenarios, or families as the gate stage names them
-    (`occlusion:tunnel`), that the gate must not have seen: without those of a fold, its decisions about that fold are
-    the ones that the stage counts. Raises TrapsError for a source without enough pairs, and for states that are means
-    over a part of the prompt.
+    layer: default: that of the gate stage. without: scenarios, or families as the gate stage names them
+    (`occlusion:tunnel`), to hold out: without those of a fold, its decisions about that fold equal the stage's. Raises
+    TrapsError for a source without enough pairs, and for states that are means over a part of the prompt.
     """
     extraction = Extraction(get_model(model).id, prompt)
     return fitted_gate(
@@ -208,8 +210,11 @@ def add(states: Tensor, unit: Tensor, amount: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A direction at a layer of a model. vector: (d,), of any length but 0. layer: 1 to the number of blocks, counted
-    as in hidden_states. gap: the distance between the sides' means along it, for doses in that unit."""
+    """A direction at a layer of a model.
+
+    vector: (d,), of any length but 0. layer: 1 to the number of blocks, counted as in hidden_states. gap: the distance
+    between the sides' means along it, the unit of doses in gaps.
+    """
 
     vector: np.ndarray
     layer: int
@@ -225,11 +230,11 @@ class Direction:
         change: Change = add,
         site: Site = "residual",
     ) -> Iterator[None]:
-        """Change a model's passes inside the context; the hook is gone afterwards, whatever happens.
+        """Change a model's passes inside the context; the hook is always removed afterwards.
 
         model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. change:
-        of the states at a site (rows, T, d), with the unit direction and the amount; with a cache, T is 1 after the
-        prompt. Raises TrapsError for a layer or width that the model lacks.
+        maps the states at a site (rows, T, d), the unit direction and the amount to new states; with a cache, T is 1
+        after the prompt. Raises TrapsError for a layer or width that the model lacks.
         """
         import torch
 
@@ -279,10 +284,10 @@ def direction(
     kind: str = "void",
     draw: int = 0,
 ) -> Direction:
-    """Return a saved direction of a study: the void direction of a dataset, or a draw of one of its nulls, with the
-    class gap.
+    """Return a saved direction of a study, with the class gap.
 
-    Raises TrapsError when the study has no such direction.
+    It is the void direction of a dataset, or a draw of one of its nulls. Raises TrapsError if the study has no such
+    direction.
     """
     directions: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
     if dataset not in directions or kind not in directions[dataset].vectors:

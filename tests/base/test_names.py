@@ -13,7 +13,7 @@ import yaml
 from tests.build.errors import raises
 from traps_pipeline.base.names import LONGEST, check_name
 from traps_pipeline.cli import main
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 
 KEYS = ["", "a_b", "a__b", "A", "a|b", "a/b", "a b", "a,b", "a\n", "ä", "a\u0663"]
@@ -40,8 +40,8 @@ def test_any_other_name_is_a_key_a_file_and_a_text(name: str, tmp_path: Path) ->
 @pytest.fixture
 def _forgets() -> Iterator[None]:
     yield
-    own._overlay.clear()
-    own.forget()
+    user_registry._overlay.clear()
+    user_registry.clear_caches()
 
 
 @pytest.mark.usefixtures("_forgets")

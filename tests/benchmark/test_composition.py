@@ -144,7 +144,7 @@ def test_the_lite_set_is_the_one_that_its_rule_chooses_from_the_released_records
 
 
 @pytest.mark.slow  # fits trees
-def test_seesaws_whose_side_the_state_at_the_cut_foretells_are_told_and_the_released_ones_are_not(
+def test_seesaws_whose_side_the_state_at_the_cut_predicts_are_reported_and_the_released_ones_are_not(
     tmp_path: Path,
 ) -> None:
     specs = [spec for spec in load_released().values() if spec.family == "seesaw_sorter"]
@@ -158,5 +158,5 @@ def test_seesaws_whose_side_the_state_at_the_cut_foretells_are_told_and_the_rele
     middle = sorted(place.values())[len(place) // 2]
     sides = [s.model_copy(update={"ground_truth": "left" if place[s.scenario_id] < middle else "right"}) for s in specs]
     (said,) = foreseeable(sides, verdicts)
-    assert said.startswith("seesaw_sorter: the state at the cut foretells 0.9") or "foretells 1.000" in said
+    assert said.startswith("seesaw_sorter: the state at the cut predicts 0.9") or "predicts 1.000" in said
     assert foreseeable(sides[:99], verdicts) == []  # too few to tell

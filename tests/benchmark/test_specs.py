@@ -24,8 +24,10 @@ def corrected(*changes: dict) -> Scenario:
         Correction.model_validate({"action": "correct", "who": "t", "when": "2026-11-21", "why": "t", **change})
         for change in changes
     ]
-    folded = fold(load_released(), [(f"review.jsonl:{n}", decision) for n, decision in enumerate(decisions, 1)])
-    return folded[decisions[0].scenario_id]
+    corrected_scenarios = fold(
+        load_released(), [(f"review.jsonl:{n}", decision) for n, decision in enumerate(decisions, 1)]
+    )
+    return corrected_scenarios[decisions[0].scenario_id]
 
 
 @pytest.mark.slow

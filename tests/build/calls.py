@@ -8,7 +8,7 @@ import json
 from typing import Any
 
 from traps_pipeline.models.budget import Budget
-from traps_pipeline.models.participants import Allowed
+from traps_pipeline.models.participants import CallContext
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Request
 
@@ -47,8 +47,8 @@ def request(item: int | str = "x") -> Request:
     return Request("m", "openai/m", PARAMS, "You watch a clip of two balls.", f"Which one, {item}?", {"item_id": item})
 
 
-def allowed_by(budget: Budget) -> Allowed:
+def allowed_by(budget: Budget) -> CallContext:
     async def require() -> None:
         """No other process is there."""
 
-    return Allowed(budget, asyncio.Event(), lambda: False, require)
+    return CallContext(budget, asyncio.Event(), lambda: False, require)

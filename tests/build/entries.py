@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 
 
 @pytest.fixture(autouse=True)
 def nobodys_own() -> Iterator[None]:
     """Entries that a test adds are forgotten at its end."""
     yield
-    own.use(own.Own(), Path("none"))
-    own.forget()
+    user_registry.add_entries(user_registry.UserRegistry(), Path("none"))
+    user_registry.clear_caches()

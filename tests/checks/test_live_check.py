@@ -12,7 +12,7 @@ from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
-from traps_pipeline.checks.live_check import Live, check_live, findings
+from traps_pipeline.checks.live_check import LiveResult, check_live, findings
 from traps_pipeline.models import api, registry
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
@@ -20,14 +20,14 @@ from traps_pipeline.models.request import Outcome
 
 pytestmark = pytest.mark.slow
 NAME = "seer"
-Check = Callable[..., Live]
+Check = Callable[..., LiveResult]
 
 
 @pytest.fixture
 def check(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Check:
     """Checks an entry at the provider, or at another address, live."""
 
-    def checked(kind: type[Entry] = ModelEntry, address: str = "", key: str | None = KEY, **changes: Any) -> Live:
+    def checked(kind: type[Entry] = ModelEntry, address: str = "", key: str | None = KEY, **changes: Any) -> LiveResult:
         account = Account(key=key, base_url=address or f"{provider.url}/v1")
         for module in (api, registry):
             monkeypatch.setattr(module, "load_accounts", lambda: {"here": account})

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from tests.build.errors import raises
 from tests.judging.conftest import item_row
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.exchange.answer_exchange import _ERROR_TEXT, Answer, Imported, import_answers
+from traps_pipeline.exchange.answer_exchange import _ERROR_TEXT, Answer, ImportResult, import_answers
 from traps_pipeline.models.answers import wanted_questions
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
@@ -69,8 +69,8 @@ def test_error_messages_among_answers_stop_an_import_until_somebody_says_what_th
     with raises(TrapsError, "exchange.answer_exchange.import_answers", "answers.jsonl", "--errors drop"):
         import_answers(study, ASKED, path)
     assert not study.answers.read(CELL.evaluation.key).settled
-    assert import_answers(study, ASKED, path, errors="drop") == Imported(1, 0, dropped=1)
-    assert import_answers(study, ASKED, path, errors="keep") == Imported(1, 1)
+    assert import_answers(study, ASKED, path, errors="drop") == ImportResult(1, 0, dropped=1)
+    assert import_answers(study, ASKED, path, errors="keep") == ImportResult(1, 1)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from traps_pipeline.judging.confabulation import (
     Labels,
     Protocol,
     collect_labels,
-    drawn,
+    draw_sample,
     load_protocol,
     render,
     sample_failures,
@@ -122,18 +122,18 @@ def labels(hp: bool, ii: bool, es: bool, doubt: bool) -> str:
 
 def test_a_sample_is_seeded_whatever_the_order_and_another_for_every_seed_and_model() -> None:
     keys = [("m", f"item-{k}") for k in range(50)]
-    sample = drawn(1, 10, keys)
+    sample = draw_sample(1, 10, keys)
     assert len(set(sample)) == 10
-    assert drawn(1, 10, reversed(keys)) == sample
-    assert drawn(2, 10, keys) != sample
-    others = drawn(1, 10, [("other", item) for _, item in keys])
+    assert draw_sample(1, 10, reversed(keys)) == sample
+    assert draw_sample(2, 10, keys) != sample
+    others = draw_sample(1, 10, [("other", item) for _, item in keys])
     assert {item for _, item in others} != {item for _, item in sample}
-    assert sorted(drawn(1, 99, keys)) == sorted(keys)  # all, if they are fewer
+    assert sorted(draw_sample(1, 99, keys)) == sorted(keys)  # all, if they are fewer
 
 
 def test_a_sample_is_uniform() -> None:
     keys = [("m", f"item-{k}") for k in range(20)]
-    counts = Counter(key for seed in range(1000) for key in drawn(seed, 5, keys))
+    counts = Counter(key for seed in range(1000) for key in draw_sample(seed, 5, keys))
     # Each of 20 is drawn 250 times of 1,000, with a standard deviation of 13.7.
     assert set(counts) == set(keys)
     assert max(abs(count - 250) for count in counts.values()) < 4 * 13.7
@@ -141,9 +141,9 @@ def test_a_sample_is_uniform() -> None:
 
 def test_a_new_failure_exchanges_one_of_the_sample_at_most() -> None:
     keys = [("m", f"item-{k}") for k in range(50)]
-    before = set(drawn(1, 10, keys))
+    before = set(draw_sample(1, 10, keys))
     for extra in range(100, 120):
-        assert len(before - set(drawn(1, 10, [*keys, ("m", f"item-{extra}")]))) <= 1
+        assert len(before - set(draw_sample(1, 10, [*keys, ("m", f"item-{extra}")]))) <= 1
 
 
 def test_only_void_failures_are_sampled_and_only_when_all_datasets_are_judged(

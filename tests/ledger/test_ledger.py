@@ -22,7 +22,7 @@ from tests.conftest import ROOT
 from tests.ledger.conftest import Place
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import Ledger, LockGivenUp
-from traps_pipeline.ledger.rows import Known, Totals, digest_of, encoded
+from traps_pipeline.ledger.rows import EvaluationRows, Totals, digest_of, encode_row
 from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES
 
 HOLD = """
@@ -133,7 +133,7 @@ def test_means_are_of_settled_rows_with_a_possible_value(ledger: Ledger) -> None
 def test_a_row_that_is_not_what_was_written_is_told_and_asked_again(ledger: Ledger) -> None:
     write(ledger, answer("a", "left"), answer("b", "right"))
     assert list(ledger.damage()) == []
-    damage(ledger, "a", encoded(answer("a", "left")).replace(b"left", b"lift"))
+    damage(ledger, "a", encode_row(answer("a", "left")).replace(b"left", b"lift"))
     known = ledger.read("m")
     assert list(known.rows) == ["b"]
     (note,) = known.notes.values()
@@ -146,7 +146,7 @@ def test_a_row_that_is_not_what_was_written_is_told_and_asked_again(ledger: Ledg
 def test_values_that_no_table_holds_are_unknown_and_told(ledger: Ledger) -> None:
     odd = {"prompt_tokens": 2**63, "completion_tokens": -1, "served_model": 5, "cost_usd": -1000.0}
     write(ledger, answer("a", "left"))
-    content = encoded(answer("a", "left") | odd)  # as no version writes it
+    content = encode_row(answer("a", "left") | odd)  # as no version writes it
     damage(ledger, "a", content, digest_of("a", content, None, None))
     known = ledger.read("m")
     assert known.rows["a"] == answer("a", "left") | dict.fromkeys(odd)
@@ -180,7 +180,7 @@ def test_an_import_whose_second_evaluation_is_taken_over_midway_stores_nothing(
     taken = sa.update(EVALUATIONS).where(EVALUATIONS.c.name == "n").values(writer="another process")
     read = Ledger.read
 
-    def read_as_another_takes_over(self: Ledger, *wanted: Any) -> Known:
+    def read_as_another_takes_over(self: Ledger, *wanted: Any) -> EvaluationRows:
         self.database.submit(lambda batch: batch.connection.execute(taken)).result()
         return read(self, *wanted)
 

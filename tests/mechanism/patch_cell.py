@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from tests.mechanism.study import register
-from traps_pipeline.mechanism import patched
-from traps_pipeline.mechanism.patching_effects import Recorded, record
+from traps_pipeline.mechanism import patching_stage
+from traps_pipeline.mechanism.patching_effects import RecordedPass, record
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.storage.workspace import Workspace
@@ -26,15 +26,15 @@ def main(place: str, described: str) -> None:
     entry, workspace = ModelEntry.model_validate_json(Path(described).read_text("utf-8")), Workspace.open(Path(place))
     passes = 0
 
-    def counting(*args: Any) -> Recorded:
+    def counting(*args: Any) -> RecordedPass:
         nonlocal passes
         passes += 1
         return record(*args)
 
     with pytest.MonkeyPatch.context() as patch:
         register(patch, entry)
-        patch.setattr(patched, "record", counting)
-        rows = patched.patching_rows(workspace, entry, Extraction("tiny", "standard"))
+        patch.setattr(patching_stage, "record", counting)
+        rows = patching_stage.patching_rows(workspace, entry, Extraction("tiny", "standard"))
     print(json.dumps({"passes": passes, "rows": [asdict(row) for row in rows]}), flush=True)
 
 

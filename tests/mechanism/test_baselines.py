@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.mechanism.baselines import noise_floor, raw_features, scored
+from traps_pipeline.mechanism.baselines import noise_floor, raw_features, score_features
 from traps_pipeline.mechanism.margin import begins_abstention
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
@@ -59,7 +59,7 @@ def test_a_cut_gives_itself_away_by_length_and_stamps_and_swapped_stamps_alone_t
     made = raw_features(by_dataset, MediaSpec(profile="frames", uniform=2), clips)
     own, run = {}, run_of(frame)
     for name, features in made.items():
-        rows = scored(run, features)
+        rows = score_features(run, features)
         own[name] = {
             r["source"]: r["value"] for r in rows if r["analysis"] == "held_out" and r["source"] == r["target"]
         }

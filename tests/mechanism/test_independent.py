@@ -22,7 +22,6 @@ from sklearn.preprocessing import StandardScaler
 
 from tests import local_models
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
-from traps_pipeline.mechanism.made_answers import MadeAnswers
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
 from traps_pipeline.mechanism.probes import auroc, fit_probe

@@ -21,13 +21,13 @@ from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import RAW
-from traps_pipeline.mechanism.deciding import ABSTENTION
 from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.live_gate import ABSTENTION
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probes import scenario_folds
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
@@ -160,7 +160,7 @@ def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_e
     void = np.arange(60) % 2 == 1
     states = rng.normal(size=(60, 8)) * rng.lognormal(size=8)
     states[void, :2] += 5
-    gone = inside.erased(states, void)
+    gone = inside.erase_side(states, void)
     assert np.abs(gone[void].mean(axis=0) - gone[~void].mean(axis=0)).max() < 1e-9
     assert np.linalg.matrix_rank(gone - gone.mean(axis=0)) == 7
     assert np.abs(LogisticRegression().fit(gone, void).coef_).max() < 1e-4
@@ -178,4 +178,4 @@ def test_the_protocol_takes_any_probe_and_any_features_of_items(study: Workspace
     figures = inside.protocol(study, "tiny", layer=2, features=some)
     assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
     with pytest.raises(TrapsError, match="lacks 2 items of chaotic"):
-        inside.protocol(study, "tiny", layer=2, features=inside.Loaded(some.X[2:], some.items.iloc[2:]))
+        inside.protocol(study, "tiny", layer=2, features=inside.LoadedStates(some.X[2:], some.items.iloc[2:]))

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, 
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.sentences import sentence_rows
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.mechanism.untrained import untrained_states
 from traps_pipeline.models.answer_rows import RESPONSES

@@ -20,7 +20,7 @@ from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import (
     Patch,
-    Recorded,
+    RecordedPass,
     _margins,
     attributed_changes,
     patched_changes,
@@ -55,7 +55,9 @@ def other(prompt: Prompt, seed: int = 2) -> Prompt:
     return Prompt(prompt.text, inputs | {"input_ids": ids})
 
 
-def pair(name: str, of: LocalModel | None = None) -> tuple[LocalModel, Recorded, Recorded, list[int], Prompt, Prompt]:
+def pair(
+    name: str, of: LocalModel | None = None
+) -> tuple[LocalModel, RecordedPass, RecordedPass, list[int], Prompt, Prompt]:
     of = of or subject(name)
     if name == POCKET:
         shown = sample(clip(), cast(MediaSpec, get_model(POCKET).media))

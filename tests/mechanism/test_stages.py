@@ -43,7 +43,7 @@ from traps_pipeline.mechanism.steering import (
     count_answers,
     strengths,
 )
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.pipeline.graph import the_graph

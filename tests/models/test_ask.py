@@ -19,7 +19,7 @@ from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import STOPS, Call, Settled, Work, run_work, settle
+from traps_pipeline.models.ask import STOPS, Call, SettledCell, Work, run_work, settle
 from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits, get_model
@@ -66,7 +66,7 @@ def work(
     def calls(cell: Cell) -> list[Call]:
         return [Call(request) for request in wanted(cell)]
 
-    def finish(settled: Settled[Cell, Call]) -> dict[str, Any]:
+    def finish(settled: SettledCell[Cell, Call]) -> dict[str, Any]:
         return {"cell": settled.cell, "rows": list(settled.rows.values()), "tally": settled.tally}
 
     entries = {name: Entry(id=name, backend="test", limits=limits) for name in backends}

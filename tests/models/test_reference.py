@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, believed, uniform
+from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, believed_probabilities, uniform
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Request, TransientError
 from traps_pipeline.protocol.regimes import FIELDS
@@ -73,7 +73,10 @@ def test_bayes_answers_what_is_probable_enough_and_states_what_it_believes() -> 
     said = {name: STRATEGIES["bayes"](replace(asked, params=get_model(name).params)) for name in BAYES}
     assert said == {"bayes": "left", "bayes-cautious": None, "bayes-rash": "left"}
     noisy = get_model("bayes-noisy").params
-    shares = [believed(replace(request("control", k), secret=asked.secret, params=noisy))["left"] for k in range(200)]
+    shares = [
+        believed_probabilities(replace(request("control", k), secret=asked.secret, params=noisy))["left"]
+        for k in range(200)
+    ]
     assert min(shares) < 0.5 < 0.75 < max(shares)
 
 

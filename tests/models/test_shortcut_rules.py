@@ -95,7 +95,9 @@ def test_without_its_cue_a_rule_says_what_the_observer_sees_and_else_the_commone
 ) -> None:
     media = clip(tmp_path, "clip.mp4")
     assert said("any", media, CHOICES, commonest_answer="maybe").endswith("The answer is: maybe.")
-    monkeypatch.setattr("traps_pipeline.models.shortcut_rules.seen", lambda digest, clip, question, frames: "yes")
+    monkeypatch.setattr(
+        "traps_pipeline.models.shortcut_rules.observer_answer", lambda digest, clip, question, frames: "yes"
+    )
     assert said("any", media, CHOICES, commonest_answer="maybe").endswith("The answer is: yes.")
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.models.request import Outcome
-from traps_pipeline.models.traffic import Breaker, Gate, Meter, Stopped, remembering_stops
+from traps_pipeline.models.traffic import Breaker, Gate, Meter, ParticipantStopped, remembering_stops
 
 ANSWER, ERROR = Outcome("answer", "left"), Outcome("error", error="timeout")
 
@@ -101,13 +101,13 @@ def test_twenty_refusals_of_one_kind_in_a_row_stop_a_model_and_nineteen_do_not()
     breaker.watch(Outcome("refused", finish_reason="content_filter"))  # another kind
     for _ in range(19):
         breaker.watch(refusal)
-    with raises(Stopped, "models.traffic.Breaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.Breaker._stop"):
         breaker.watch(refusal)
 
 
 def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None:
     breaker = Breaker("m")
-    with raises(Stopped, "models.traffic.Breaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.Breaker._stop"):
         for _ in range(20):
             breaker.watch(Outcome("error", error="http_401"))
 
@@ -120,9 +120,9 @@ def test_a_stop_lasts_for_the_whole_run_and_no_longer() -> None:
 
     with remembering_stops():
         breaker = Breaker("m")
-        with pytest.raises(Stopped) as first:
+        with pytest.raises(ParticipantStopped) as first:
             stop("m")
-        with pytest.raises(Stopped) as again:
+        with pytest.raises(ParticipantStopped) as again:
             Breaker("m").check()  # as the next batch of the run makes it
         assert str(again.value) == str(first.value)
         Breaker("n").check()
@@ -133,7 +133,7 @@ def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
     breaker = Breaker("m")
     for n in range(100):
         breaker.watch(ERROR if n % 10 == 0 else ANSWER)  # ten: at the limit
-    with raises(Stopped, "models.traffic.Breaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.Breaker._stop"):
         for n in range(1, 12):
             breaker.watch(ERROR if n % 2 else ANSWER)
 
@@ -173,5 +173,5 @@ def test_five_calls_in_a_row_that_never_left_over_twelve_seconds_stop_a_model_an
     for _ in range(5):
         breaker.no_connection()
     now[0] += 12
-    with raises(Stopped, "models.traffic.Breaker._stop", "http://127.0.0.1:8000/v1", "no such name"):
+    with raises(ParticipantStopped, "models.traffic.Breaker._stop", "http://127.0.0.1:8000/v1", "no such name"):
         breaker.no_connection("no such name")

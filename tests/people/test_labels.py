@@ -16,7 +16,7 @@ from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.people.human_label_rows import HUMAN_LABELS, LABELS_FILE, labels_version
 from traps_pipeline.people.label_units import annotation_protocol, drawn_units, queue_of
 from traps_pipeline.people.labels import confabulation_rows, human_agreement, label_lines, matrix, truths
-from traps_pipeline.storage.lines import checked_line
+from traps_pipeline.storage.lines import line_with_checksum
 
 PROTOCOL = annotation_protocol()
 
@@ -52,7 +52,7 @@ def test_each_person_has_an_order_of_their_own_over_the_same_units() -> None:
 
 def line(seq: int, **own: Any) -> bytes:
     row = {"seq": seq, "task": "abstention", "unit": "u1", "who": "jd", "at": "2026-11-22T12:00:00+00:00"}
-    return checked_line(row | {"seconds": 3.5, "label": {"abstained": True}} | own)
+    return line_with_checksum(row | {"seconds": 3.5, "label": {"abstained": True}} | own)
 
 
 def test_labels_are_read_as_written_and_damage_is_named(tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.release.commitment import (
     broken_seals,
     commit,
+    is_same_scene,
     read_commitment,
     read_reveal,
     revealed_specs,
-    same_scene,
 )
 
 __all__ = ["committed"]  # a fixture
@@ -91,9 +91,9 @@ def test_records_that_were_chosen_and_not_drawn_are_refused(copy: Path, committe
         "hidden_drop-0001: is not the record that was committed"
     ]
     chosen = load_released(copy / "private" / "released")
-    assert not same_scene(drawn["hidden_drop-0001"], chosen["hidden_drop-0001"])
+    assert not is_same_scene(drawn["hidden_drop-0001"], chosen["hidden_drop-0001"])
     elsewhere = drawn["hidden_drop-0001"].model_copy(update={"trajectory_sha256": "0" * 64})
-    assert same_scene(drawn["hidden_drop-0001"], elsewhere)
+    assert is_same_scene(drawn["hidden_drop-0001"], elsewhere)
 
 
 def test_a_commitment_is_made_once_and_of_one_draw(copy: Path, tmp_path: Path) -> None:

@@ -17,12 +17,12 @@ from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
-from traps_pipeline.exchange.answer_exchange import Whose, import_answers
+from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.release.harness.scoring import figures, judge
-from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
+from traps_pipeline.release.harness.write import SHOWN, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
@@ -76,7 +76,7 @@ def test_what_is_no_answer_is_missing_and_decides_nothing(workspace: Workspace) 
         ("answer", "Das lässt sich nicht bestimmen.", "unread"),
     ):  # fmt: skip
         judged = judge(item, outcome, text, "standard")
-        assert (judged.outcome, judged.abstained, judged.correct, judged.right) == (read, None, None, False)
+        assert (judged.outcome, judged.abstained, judged.correct, judged.is_right) == (read, None, None, False)
     shrugs = figures([judge(item, "answer", text, "standard") for text in ("", "IDK")])
     assert (shrugs["missing"], shrugs["unread"]) == (2, 1)
 
@@ -111,7 +111,7 @@ def test_its_code_is_the_pipelines_own_and_needs_nothing_of_it(harness: Path) ->
         assert {*neighbours} <= {each.stem for each in paths}
         allowed = {*sys.stdlib_module_names, "traps_harness", "inspect_ai"}
         assert [name for name in names if name.partition(".")[0] not in allowed] == []
-    assert copied("from traps_pipeline.judging.rules import x\n") == "from traps_harness.rules import x\n"
+    assert rewritten_source("from traps_pipeline.judging.rules import x\n") == "from traps_harness.rules import x\n"
 
 
 def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_pat
     with pytest.raises(TrapsError, match="holds other files"):
         write_harness(released, copy)
     with pytest.raises(TrapsError, match="--uniform: goes with --media images"):
-        shown("video", 2)
+        media_settings("video", 2)
 
 
 # --- answers come back ------------------------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ def test_a_wrong_answer_by_item_is_named_and_nothing_is_imported(
     path = tmp_path / "answers.jsonl"
     path.write_text("".join(json.dumps(line).replace('"ID"', json.dumps(id_)) + "\n" for line in lines))
     with pytest.raises(TrapsError, match=said):
-        import_answers(workspace, experiment, path, Whose("oracle"))
+        import_answers(workspace, experiment, path, AnswerContext("oracle"))
     with pytest.raises(TrapsError, match="say whose answers these are: --model, one of oracle, prior, random-50"):
         import_answers(workspace, experiment, path)
     assert workspace.answers.read("oracle__json__run1").settled == {}

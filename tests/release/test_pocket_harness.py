@@ -17,7 +17,7 @@ from tests.serving import transformers_serve
 from traps_pipeline.exchange.harness_logs import reader_of
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.release.harness.scoring import RUN_FIGURES
-from traps_pipeline.release.harness.write import shown, write_harness
+from traps_pipeline.release.harness.write import media_settings, write_harness
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -66,7 +66,7 @@ def served(demo: Checkout, released: Path, tmp_path_factory: pytest.TempPathFact
     folder = tmp_path_factory.mktemp("served")
     shutil.copytree(demo.workspace / "clips", folder / "study" / "clips")
     study = Checkout(ROOT, folder / "study")
-    write_harness(released, folder / "harness", shown("images", 8))
+    write_harness(released, folder / "harness", media_settings("images", 8))
     with transformers_serve(WEIGHTS, folder) as url:
         experiment = EXPERIMENT.format(url=url, weights=WEIGHTS) + DEMO[DEMO.index("scenarios:") :]
         (folder / "served.yaml").write_text(experiment)

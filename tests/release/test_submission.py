@@ -23,7 +23,7 @@ from traps_pipeline.release.submission import ABOUT, TABLES, _zipped, pack, read
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
-from traps_pipeline.scoring.scored import score
+from traps_pipeline.scoring.scores import score
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ from tests.build.entries import nobodys_own
 from tests.conftest import EXPERIMENT, ROOT, Checkout
 from tests.remedies.remedied import remedied
 from traps_pipeline.exchange import harness_logs
-from traps_pipeline.exchange.answer_exchange import Whose, checked_answers, export_requests, import_answers
+from traps_pipeline.exchange.answer_exchange import AnswerContext, checked_answers, export_requests, import_answers
 from traps_pipeline.exchange.provider_batch import FOLDER, export_batches
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -78,13 +78,15 @@ def test_answers_are_imported_once_it_is_said_whose_they_are_and_no_error_is_amo
     found = remedied(
         lambda: import_answers(unasked_copy, asks, path),
         "exchange.answer_exchange",
-        again=lambda: import_answers(unasked_copy, asks, path, Whose("prior")),
+        again=lambda: import_answers(unasked_copy, asks, path, AnswerContext("prior")),
     )
     assert found.new == 1
     wrong = {"item": items[1], "regime": "json", "outcome": "error"}
     written(right, wrong)()
     found = remedied(
-        lambda: import_answers(unasked_copy, asks, path, Whose("prior")), "exchange.answer_exchange", written(right)
+        lambda: import_answers(unasked_copy, asks, path, AnswerContext("prior")),
+        "exchange.answer_exchange",
+        written(right),
     )
     assert (found.new, found.known) == (0, 1)
     given = tmp_path / "by_key.jsonl"

@@ -11,7 +11,7 @@ from tests.build.mechanism import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import remedied
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.protocol.cells import StatesCell
 from traps_pipeline.storage.workspace import Workspace
 
@@ -48,4 +48,4 @@ def test_states_that_are_missing_or_damaged_are_extracted_again(own: Workspace) 
     remedied(read, "mechanism.hidden_states", deleted_and_run)
     rows = own.tables.read(HIDDEN_STATES, CHAOTIC.partition)
     own.tables.write(HIDDEN_STATES, CHAOTIC.partition, rows.assign(states_key="another"), {})
-    remedied(read, "mechanism.stored.StoredStates.read", extracted(own))
+    remedied(read, "mechanism.stored_states.StoredStates.read", extracted(own))

@@ -12,7 +12,7 @@ from tests.remedies.remedied import command, remedied
 from traps_pipeline.release.checksums import CHECKSUMS
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.release.results import Who, write_results
+from traps_pipeline.release.results import Attribution, write_results
 from traps_pipeline.release.submission import pack, read_submission
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -70,16 +70,16 @@ def test_results_are_of_a_repository_and_of_models_that_were_run(
     workspace: Workspace, small: Checkout, tmp_path: Path
 ) -> None:
     remedied(
-        lambda: write_results(workspace, tmp_path / "out", "traps", Who()),
+        lambda: write_results(workspace, tmp_path / "out", "traps", Attribution()),
         "release.results.write_results",
-        again=lambda: write_results(workspace, tmp_path / "out", "me/traps", Who()),
+        again=lambda: write_results(workspace, tmp_path / "out", "me/traps", Attribution()),
     )
     root = tmp_path / "study"
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
     board = root / "tables" / "leaderboard"
     aside = board.rename(tmp_path / "aside")
     remedied(
-        lambda: write_results(Workspace.open(root), tmp_path / "out", "me/traps", Who()),
+        lambda: write_results(Workspace.open(root), tmp_path / "out", "me/traps", Attribution()),
         "release.results.write_results",
         lambda: aside.rename(board),
     )

@@ -11,9 +11,9 @@ import pandas as pd
 
 from tests.build.latex import latex_cells
 from traps_pipeline.report.writing import (
-    Behind,
     Column,
     PrintedTable,
+    SourceItems,
     figure_files,
     figure_style,
     latex,
@@ -95,7 +95,7 @@ def test_markdown_keeps_a_hostile_text_in_its_cell():
 
 def test_html_escapes_texts_and_links_numbers_to_their_items():
     page = table_html(
-        table(trace=lambda row, field: Behind(model="m")), lambda behind: f"items/{behind.model}.html#<x>"
+        table(trace=lambda row, field: SourceItems(model="m")), lambda behind: f"items/{behind.model}.html#<x>"
     )
     assert "<b>" not in page
     assert "&lt;b&gt;" in page

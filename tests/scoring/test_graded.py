@@ -16,12 +16,12 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
-from traps_pipeline.scoring.graded import Asked, brier, decided, graded, wrong_rows
+from traps_pipeline.scoring.graded import GradedItem, brier, decided, graded, wrong_rows
 
 LABELS = ("left", "right", "elsewhere")
 # An answer is worth .9 - 3 x .1 = .6 in the first, .5 - 3 x .5 = -1 in the second. Of the family "right" is commonest.
-SURE = Asked(LABELS, {"red bin": "left"}, "direction", "right", {"left": 0.9, "right": 0.1})
-OPEN = Asked(LABELS, {}, "direction", "right", {"left": 0.5, "right": 0.3, "elsewhere": 0.2})
+SURE = GradedItem(LABELS, {"red bin": "left"}, "direction", "right", {"left": 0.9, "right": 0.1})
+OPEN = GradedItem(LABELS, {}, "direction", "right", {"left": 0.5, "right": 0.3, "elsewhere": 0.2})
 ASKED = {"graded:plinko-0001:control": SURE, "graded:plinko-0002:control": OPEN}
 # The answer that two of three judges extract, or what each of them does; None for an abstention.
 Said = str | tuple[str, ...] | None
@@ -45,7 +45,7 @@ def test_the_prompt_states_the_price_that_is_scored() -> None:
     ],
 )
 def test_regret_is_what_the_ideal_observer_earns_more_and_falls_into_three(
-    item: Asked, answer: str | None, points: float, by_answer: float, rash: float, shy: float
+    item: GradedItem, answer: str | None, points: float, by_answer: float, rash: float, shy: float
 ) -> None:
     of = decided(item, answer)
     assert of["points"] == pytest.approx(points)

@@ -9,15 +9,15 @@ import pytest
 from pydantic import ValidationError
 
 from tests.build.errors import raises
-from traps_pipeline.models.framing import framed
-from traps_pipeline.storage.media import MediaSpec, pick, profile_digest, resized
+from traps_pipeline.models.framing import media_for_dataset
+from traps_pipeline.storage.media import MediaSpec, pick, profile_digest, resize
 
 
 def test_a_cropped_frame_keeps_its_shape_and_its_middle():
     # 4 x 2 onto 2 x 2: nothing is resized, and one column is lost on each side; stretching would mix the columns.
     frame = np.repeat(np.array([[10, 20, 30, 40]], np.uint8), 2, axis=0)[None, :, :, None].repeat(3, axis=3)
-    assert resized(frame, (2, 2), "crop")[0, :, :, 0].tolist() == [[20, 30], [20, 30]]
-    assert resized(frame, (2, 2))[0, 0, :, 0].tolist() == [15, 35]
+    assert resize(frame, (2, 2), "crop")[0, :, :, 0].tolist() == [[20, 30], [20, 30]]
+    assert resize(frame, (2, 2))[0, 0, :, 0].tolist() == [15, 35]
     with raises(ValidationError, "MediaSpec"):
         MediaSpec(profile="frames", fps=2, fit="crop")
 
@@ -26,20 +26,23 @@ def test_frames_that_are_shown_later_are_the_next_ones_and_the_last_one_stays():
     times = np.arange(50) / 10
     spec = MediaSpec(profile="frames", fps=5)
     assert pick(times, spec).tolist() == list(range(0, 50, 2))
-    assert pick(times, framed(spec, "frames_later")).tolist() == list(range(1, 50, 2))
+    assert pick(times, media_for_dataset(spec, "frames_later")).tolist() == list(range(1, 50, 2))
     ends = MediaSpec(profile="frames", uniform=2)
-    assert pick(times, ends).tolist() == [0, 49] and pick(times, framed(ends, "frames_later")).tolist() == [1, 49]
-    assert profile_digest(spec) != profile_digest(framed(spec, "frames_later"))
+    assert pick(times, ends).tolist() == [0, 49] and pick(times, media_for_dataset(ends, "frames_later")).tolist() == [
+        1,
+        49,
+    ]
+    assert profile_digest(spec) != profile_digest(media_for_dataset(spec, "frames_later"))
 
 
 @pytest.mark.parametrize("profile", ["video", "images", "frames"])
 def test_a_rate_of_frames_takes_the_place_of_a_models_own(profile: Literal["video", "images", "frames"]):
     times = np.arange(50) / 10
     own = MediaSpec(profile=profile, fps=5, size=(336, 336), fit="crop")
-    few, every = framed(own, "frames_few"), framed(own, "frames_all")
+    few, every = media_for_dataset(own, "frames_few"), media_for_dataset(own, "frames_all")
     assert len(pick(times, few)) == 10 and len(pick(times, every)) == 50
     assert (few.size, few.fit, every.profile) == ((336, 336), "crop", profile)
     assert MediaSpec.model_validate(few.model_dump()) == few  # what a variation makes, an entry could say
     cut = times[:18]
     assert pick(cut, every).tolist() == list(range(18)) and pick(cut, few).tolist() == [0, 5, 10, 15]
-    assert framed(own, "occlusion") is own
+    assert media_for_dataset(own, "occlusion") is own

@@ -21,7 +21,7 @@ from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.objects import OBJECTS, ObjectStore
 from traps_pipeline.cluster.places import SharedFolder
 from traps_pipeline.storage.benchmark_tables import VIDEOS
-from traps_pipeline.storage.leases import alone, leased
+from traps_pipeline.storage.leases import alone, leased_ranges
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
 
@@ -181,9 +181,9 @@ def test_what_a_killed_process_held_is_free_again(where: Sequence[str]) -> None:
 
 def test_ranges_are_shared_and_those_that_others_have_come_last(hosts: Hosts) -> None:
     one, other = hosts.open("one"), hosts.open("other")
-    theirs = leased(other, "items", 10, 4)
+    theirs = leased_ranges(other, "items", 10, 4)
     assert next(theirs) == range(4)
-    mine = leased(one, "items", 10, 4)
+    mine = leased_ranges(one, "items", 10, 4)
     assert [next(mine), next(mine)] == [range(4, 8), range(8, 10)]
     theirs.close()
     assert [*mine] == [range(4)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.cli import main
-from traps_pipeline.cli.command import OK, Commands, Parser, Run, whole
+from traps_pipeline.cli.command import OK, Commands, Parser, Run, integer
 
 if TYPE_CHECKING:
     from tools.pocket.recipe import Recipe
@@ -33,7 +33,7 @@ def build_parser() -> Parser:
     _add_scenes(command)
     _add_weights(command)
     command.add_argument(
-        "--scenes", type=whole(1, 1_000_000), help="number of held-out scenes per family (default: all)"
+        "--scenes", type=integer(1, 1_000_000), help="number of held-out scenes per family (default: all)"
     )
     command.add_argument("--csv", type=Path, help="file of the counts (default: assets/pocket/evaluation.csv)")
 
@@ -60,11 +60,13 @@ def _add(commands: Commands, name: str, run: Run, text: str) -> argparse.Argumen
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the rendered scenes")
-    parser.add_argument("--workers", type=whole(1, 1024), help="processes that render (default: one per core)")
+    parser.add_argument("--workers", type=integer(1, 1024), help="processes that render (default: one per core)")
 
 
 def _add_weights(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=whole(0, 2**63 - 1), default=1, help="seed of weights and batches (default: 1)")
+    parser.add_argument(
+        "--seed", type=integer(0, 2**63 - 1), default=1, help="seed of weights and batches (default: 1)"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for the weights of this seed")
 
 

@@ -31,7 +31,7 @@ from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.worlds.outcome import Rejected
-from traps_pipeline.storage.media import pick, resized
+from traps_pipeline.storage.media import pick, resize
 from traps_pipeline.video.encode import encode
 
 SHARD = 50  # scenes
@@ -231,7 +231,7 @@ def draw_shard(job: ShardJob) -> int:
         if job.split == "train":
             if job.recipe.decoys and shot.control.panel is not None:
                 sides.append(decoy or sides[0])  # an array has one shape; without a decoy its place is never looked at
-            frames.append(np.stack([resized(np.stack(side), job.recipe.media.size) for side in sides]))
+            frames.append(np.stack([resize(np.stack(side), job.recipe.media.size) for side in sides]))
         else:
             _write_clips(job, record, len(records), sides)
         records.append(record)

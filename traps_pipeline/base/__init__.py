@@ -1,1 +1,1 @@
-"""What every other room uses: errors, files, digests, paths, keys, and what is said on a terminal."""
+"""Shared helpers below every other room: errors, files, digests, paths, keys and terminal output."""

@@ -1,10 +1,10 @@
-"""How many cores work may use: those of this process, or those that a cluster has set aside for its run."""
+"""Count the cores that work may use: those of this process, or those that a cluster reserved for its run."""
 
 from __future__ import annotations
 
 import os
 
-CORES = "TRAPS_CORES"  # of a run on a cluster; set by who submits it
+CORES = "TRAPS_CORES"  # set by the submitter of a run on a cluster
 
 
 def cores() -> int:

@@ -1,4 +1,4 @@
-"""What a database's error means: a reason and a remedy, without the text of SQLAlchemy or of a statement."""
+"""Translate a database's error into a reason and a remedy, without the text of SQLAlchemy or of a statement."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ _SERVER = r"connection to server|could not translate host name|server closed the
 
 
 def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
-    """Return why a database cannot be used (its driver's or SQLAlchemy's error), a remedy, and if it is unwritable."""
+    """Return why a database cannot be used, a remedy, and whether the database is unwritable.
+
+    error: raised by its driver or by SQLAlchemy.
+    """
     words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MOST_WORDS]
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):
@@ -31,7 +34,7 @@ def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
 
 
 def database_error(error: BaseException) -> BaseException | None:
-    """Return the error of a database that an exception is, or was raised from; None where there is none."""
+    """Return the database error that an exception is or was raised from; None if there is none."""
     from sqlalchemy.exc import DBAPIError
 
     current: BaseException | None = error

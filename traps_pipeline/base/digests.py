@@ -1,4 +1,4 @@
-"""One way to turn a value into a digest: SHA-256 of canonical JSON."""
+"""The one way to hash a value: SHA-256 of canonical JSON."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def canonical_json(value: Any) -> str:
 
 
 def digest(value: Any) -> str:
-    """Return hexadecimal SHA-256 of a JSON-able value."""
+    """Return the SHA-256 of a JSON-able value in hexadecimal."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
 def digest_of_list(values: Iterable[Any]) -> str:
-    """Return `digest(list(values))`, one value held at a time: the text of a whole table would be a copy of it."""
+    """Return `digest(list(values))` while holding one value at a time, so that a large table fits in memory."""
     hasher, separator = hashlib.sha256(b"["), b""
     for value in values:
         hasher.update(separator + canonical_json(value).encode())
@@ -30,6 +30,6 @@ def digest_of_list(values: Iterable[Any]) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Return hexadecimal SHA-256 of a file's bytes."""
+    """Return the SHA-256 of a file's bytes in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

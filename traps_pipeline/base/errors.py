@@ -6,7 +6,7 @@ from traps_pipeline.base.redaction import redact
 
 
 class TrapsError(Exception):
-    """Bad input or a broken file: the message names file and record, says what to do, and holds no key."""
+    """Report bad input or a broken file. The message names file and record, says what to do, and holds no key."""
 
     def __init__(self, message: object) -> None:
         super().__init__(redact(str(message)))

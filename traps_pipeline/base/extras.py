@@ -1,4 +1,4 @@
-"""What is installed only where it is used: the extras of `pyproject.toml`; a missing one is named in a sentence."""
+"""The optional dependencies (`extras` of `pyproject.toml`), and the error that names a missing one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ExtraName = Literal["api", "local", "nf4", "sign", "cluster", "ui", "web"]
 
 @dataclass(frozen=True)
 class Extra:
-    """What an extra is for, and the modules that this code imports from it."""
+    """An optional dependency: its purpose, and the modules that this code imports from it."""
 
     purpose: str
     modules: tuple[str, ...]
@@ -33,23 +33,23 @@ EXTRAS: Mapping[ExtraName, Extra] = {
 
 
 def install_line(name: ExtraName) -> str:
-    """Return what to type to get an extra."""
+    """Return the command that installs an extra."""
     return f"python -m pip install 'traps-pipeline[{name}]'" if IS_INSTALLED else "make setup"
 
 
 def missing(name: ExtraName, *modules: str) -> list[str]:
-    """Return the modules of an extra (or only these of it) that are not installed. None of them is imported."""
+    """Return the modules of an extra (or only the given ones) that are not installed, without importing any."""
     return [module for module in modules or EXTRAS[name].modules if find_spec(module) is None]
 
 
 def require(name: ExtraName, *modules: str) -> None:
-    """Raise TrapsError with the line to type unless an extra is installed. Call it before its first import."""
+    """Raise TrapsError with the command to type unless an extra is installed. Call it before its first import."""
     if absent := missing(name, *modules):
         raise TrapsError(_sentence(name, absent))
 
 
 def sentence_of(error: ModuleNotFoundError) -> str | None:
-    """Return the same sentence for an import that nobody looked after; None for a module of no extra."""
+    """Return the sentence of `require` for an ImportError; None if the module belongs to no extra."""
     module = (error.name or "").partition(".")[0]
     known: tuple[ExtraName, ...] = get_args(ExtraName)
     return next((_sentence(name, [module]) for name in known if module in EXTRAS[name].modules), None)

@@ -1,4 +1,4 @@
-"""The one way to write a file: whole or not at all."""
+"""Write files atomically: a file is complete or absent."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ def remedy(error: OSError) -> str:
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a path beside `path` for the block to write to; at its end that file takes the place of `path`.
+    """Yield a temporary path beside `path`; when the block ends, that file replaces `path`.
 
-    Until then, and after an error, Ctrl-C or a kill, `path` is what it was before. An unfinished file is removed. Only
-    a kill leaves it, hidden and named `*.part`; nothing reads it. Missing folders are made.
+    Until then, and after an error, Ctrl-C or a kill, `path` keeps its former content. An unfinished file is removed;
+    only a kill leaves one, hidden and named `*.part`, which nothing reads. Missing folders are created.
 
-    durable: the content is on the disk before it gets its name, so that not even a power cut leaves a torn file under
-    that name. Raises TrapsError that names `path` when it cannot be written; an OSError about another file, which the
-    block reads, passes as it is.
+    durable: sync the content to disk before it gets its name, so that a power cut leaves no torn file under that name.
+    Raises TrapsError that names `path` when it cannot be written; an OSError about another file, which the block reads,
+    passes unchanged.
     """
-    # No process, thread or machine that shares the folder draws the same name.
+    # Unique among all processes, threads and machines that share the folder.
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
         finally:
             part.unlink(missing_ok=True)
     except BrokenPipeError:
-        raise  # of what the block prints to
+        raise  # the reader of the block's output has gone
     except OSError as error:
         if error.filename is not None and str(error.filename) not in map(str, (part, *path.parents)):
             raise
@@ -74,7 +74,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk: a file that is synced may still lose its name in a power cut."""
+    """Sync a folder's entries to disk: without it, a synced file can still lose its name in a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -83,7 +83,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_in_place(descriptor: int, path: Path) -> bool:
-    """Return whether an open file still has its name: a lock on one that was removed keeps nobody out."""
+    """Return whether an open file still has its name: a lock on a removed file excludes nobody."""
     try:
         current, own = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
@@ -92,8 +92,10 @@ def is_in_place(descriptor: int, path: Path) -> bool:
 
 
 def try_lock(path: Path) -> int | None:
-    """Return the descriptor of a lock file that this process now holds alone, until it is closed or the process ends;
-    None while another one holds it. Missing folders are made. Raises OSError."""
+    """Return the descriptor of a lock file that this process now holds; None if another process holds it.
+
+    The lock lasts until the descriptor is closed or the process ends. Missing folders are created. Raises OSError.
+    """
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -101,7 +103,7 @@ def try_lock(path: Path) -> int | None:
         except FileNotFoundError:
             if path.parent.is_dir():
                 raise
-            continue  # who gave a lock back has removed the folder
+            continue  # the process that released the lock has removed the folder
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -115,7 +117,7 @@ def try_lock(path: Path) -> int | None:
 
 
 def require_in_place(descriptor: int, path: Path) -> None:
-    """Raise TrapsError where the file of a lock that this process holds was removed: another run may hold it too."""
+    """Raise TrapsError if the file of a lock that this process holds was removed: another run may hold it too."""
     if not is_in_place(descriptor, path):
         raise TrapsError(
             f"{path}: was removed while this run held it, so that another run may ask the same calls; nothing more is "
@@ -124,18 +126,18 @@ def require_in_place(descriptor: int, path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Write a file as `replacing` does."""
+    """Write a file atomically, as `replacing` does."""
     with replacing(path, durable=durable) as part:
         part.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text as `replacing` does."""
+    """Write UTF-8 text atomically, as `replacing` does."""
     write_bytes(path, text.encode())
 
 
 def is_same_file(one: Path, other: Path) -> bool:
-    """Return whether two names stand for one file, which is there."""
+    """Return whether two paths name one existing file."""
     try:
         return one.samefile(other)
     except FileNotFoundError:
@@ -143,7 +145,7 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 
 def link(existing: Path, path: Path) -> None:
-    """Give a file another name, in the place of what has it: files that have a name are replaced as a whole."""
+    """Hard-link an existing file to `path`, replacing any file there (files are only ever replaced as a whole)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
@@ -154,7 +156,7 @@ def link(existing: Path, path: Path) -> None:
 
 
 def check_disk(folder: Path, least_gb: float) -> str:
-    """Return the free space at a folder, which need not exist yet, in words. Raises TrapsError where it is less."""
+    """Return the free space at a folder (which need not exist yet) in words. Raises TrapsError if it is too small."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free / 1e9
     if free < least_gb:

@@ -1,6 +1,7 @@
-"""Read keys from the environment: the one place that does, and that refuses a key which no header can carry.
+"""Read API keys from the environment; refuse a key that no header can carry.
 
-A key that stands in a file is refused, too: what an entry holds is kept in the ledger, the workspace and releases.
+This is the one place that reads them. A key in a file is refused too: what an entry holds is stored in the ledger, the
+workspace and releases.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pydantic import AfterValidator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.redaction import remember
 
-# Parameters that hold a key, or send it elsewhere than to the account's address.
+# Parameters that hold a key, or that send it to another address than the account's.
 _NO_PARAMETER = re.compile(
     r"(api|access)[_-]?key$|(^|[_-])(token|secret|password|credentials|authorization|headers)$|^(api_base|base_url)$",
     re.IGNORECASE,
@@ -28,7 +29,7 @@ _NAMES = {"\n": "a line break", "\r": "a carriage return", "\t": "a tab", " ": "
 def read_key(variable: str) -> str:
     """Return the key in an environment variable.
 
-    Raises TrapsError, which names the variable and never the value, where it is not set or `check_key` refuses it.
+    Raises TrapsError, which names the variable and never the value, if it is not set or `check_key` refuses it.
     """
     value = optional_key(variable)
     if value is None:
@@ -37,7 +38,7 @@ def read_key(variable: str) -> str:
 
 
 def optional_key(variable: str) -> str | None:
-    """Return the key in an environment variable; None where it is not set. Raises as `read_key`."""
+    """Return the key in an environment variable; None if it is not set. Raises TrapsError as `read_key` does."""
     value = os.environ.get(variable)
     if not value:
         return None
@@ -49,8 +50,8 @@ def optional_key(variable: str) -> str | None:
 def check_key(variable: str, value: str) -> None:
     """Check that a key, or an address with a password, consists of printable ASCII characters without white space.
 
-    What is more is refused and not removed, so that every program reads the same key from the variable.
-    Raises TrapsError, which names the variable and never the value.
+    White space is refused, not stripped, so that every program reads the same key from the variable. Raises TrapsError,
+    which names the variable and never the value.
     """
     problem = _problem(value)
     if problem:
@@ -58,8 +59,7 @@ def check_key(variable: str, value: str) -> None:
 
 
 def check_parameters(params: Mapping[str, Any]) -> None:
-    """Raise ValueError, which names no value, for a parameter of a call, at any depth, that holds a key or an
-    address."""
+    """Raise ValueError if a call's parameters hold a key or an address at any depth. The error names no value."""
     for name, value in params.items():
         if _NO_PARAMETER.search(str(name)):  # a token's number in `logit_bias`
             raise ValueError(
@@ -72,7 +72,7 @@ def check_parameters(params: Mapping[str, Any]) -> None:
 
 
 def check_address(address: str) -> str:
-    """Return the address itself. Raises ValueError, which does not repeat it, where it may hold a key."""
+    """Return the address unchanged. Raises ValueError, which does not repeat it, if it may hold a key."""
     parts = urlsplit(address)
     if parts.username is not None or parts.query or parts.fragment:
         raise ValueError("holds more than scheme, host, port and path: export the key and name its variable as `key`")
@@ -80,7 +80,7 @@ def check_address(address: str) -> str:
 
 
 def check_variable(name: str) -> str:
-    """Return the name itself. Raises ValueError, which does not repeat it, where it may be the key."""
+    """Return the variable's name unchanged. Raises ValueError, which does not repeat it, if it may be the key."""
     if not re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
         raise ValueError("is the name of the environment variable that holds a key, such as MY_KEY, not the key itself")
     return name

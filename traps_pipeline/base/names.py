@@ -1,4 +1,4 @@
-"""Check the names that people give: of models, judges, panels, accounts, experiments, benchmarks and submissions."""
+"""Validate names that users choose: of models, judges, panels, accounts, experiments, benchmarks and submissions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _NAME = re.compile(rf"(?!.*\.\.)[a-z0-9](?:[a-z0-9.-]{{0,{LONGEST - 2}}}[a-z0-9]
 
 @lru_cache(maxsize=4096)
 def check_name(name: str) -> str:
-    """Return the name itself.
+    """Return the name unchanged.
 
-    Raises ValueError unless it can be a part of a partition key, which holds no `...`, of a path, of a file name and of
-    an option, and unless every reader of YAML, CSV and partitioned folders takes it for text.
+    Raises ValueError unless it is valid in a partition key (so it contains no `...`), a path, a file name and an
+    option, and unless every reader of YAML, CSV and partitioned folders reads it as text.
     """
     if not _NAME.fullmatch(name) or not _is_text(name):
         raise ValueError(

@@ -1,6 +1,6 @@
-"""What the environment says of a connection: which proxy it names, which certificates, and what is wrong with them.
+"""Check the environment's proxy and certificate variables, and say what is wrong with them.
 
-Client libraries read these variables by themselves, and their errors name none.
+Client libraries read these variables on their own, and their errors do not name them.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from traps_pipeline.base.errors import TrapsError
 PROXIES = ("http_proxy", "https_proxy", "all_proxy")  # in small or capital letters
 _READ = tuple(name for low in (*PROXIES, "no_proxy") for name in (low, low.upper()))
 PROXY_SCHEMES = ("http", "https")  # SOCKS takes a package of its own, in every client library
-TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # of calls
-CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # of some library
+TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # read by calls
+CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # read by some library
 
 
 @dataclass(frozen=True)
 class Proxy:
-    """A proxy as the environment names it. variable: the variable's name, or "the system's settings"."""
+    """A proxy that the environment configures. variable: the variable's name, or "the system's settings"."""
 
     variable: str
     url: str
@@ -39,7 +39,7 @@ class Proxy:
 
     @property
     def problem(self) -> str | None:
-        """Return why no call can go through this proxy; None if one may."""
+        """Why no call can go through this proxy; None if one may."""
         if not _is_address(self.url):
             return f"{self.variable} is no address of a proxy: write it as http://HOST:PORT, or unset it"
         if urlsplit(self.url).scheme in PROXY_SCHEMES:
@@ -73,7 +73,7 @@ def is_loopback(host: str) -> bool:
 
 
 def proxy_of(url: str) -> Proxy | None:
-    """Return the proxy that the environment names for a URL; None for loopback addresses, whatever it says."""
+    """Return the proxy that the environment configures for a URL; None for loopback addresses in any case."""
     parts = urlsplit(url)
     return _proxy_of(parts.scheme, parts.hostname or "", tuple(os.environ.get(name) for name in _READ))
 
@@ -92,10 +92,10 @@ def _proxy_of(scheme: str, host: str, _: tuple[str | None, ...]) -> Proxy | None
 
 
 def check_network() -> str:
-    """Return what the environment says of proxies and certificates, in words.
+    """Return the proxies and certificates that the environment configures, in words.
 
-    Raises TrapsError, which names the variable, for what is no address of a proxy and certificates that are not there.
-    A SOCKS proxy is refused where a call would go through it, since loopback addresses do not.
+    Raises TrapsError that names the variable if its value is not a proxy's address or names missing certificates. A
+    SOCKS proxy is refused if a call would go through it; loopback addresses bypass it.
     """
     proxies = [name for name, value in os.environ.items() if name.lower() in PROXIES and value]
     for name in proxies:
@@ -110,7 +110,7 @@ def check_network() -> str:
 
 
 def certificate_problem(variables: Sequence[str]) -> str | None:
-    """Return the sentence about a variable that names no certificates; None if there is none."""
+    """Return the sentence about a variable that names no certificates; None if all are sound."""
     for variable in variables:
         value = os.environ.get(variable)
         if value and (problem := _certificates_problem(variable, value)):

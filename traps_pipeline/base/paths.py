@@ -1,7 +1,7 @@
-"""Where the files that belong to the code lie: `assets/`, `scene_specs/` and `dagster.yaml`.
+"""Locate the files that belong to the code: `assets/`, `scene_specs/` and `dagster.yaml`.
 
-They are top-level folders of the repository, and a wheel carries them inside the package (`SHIPPED`). Everything that
-reads them asks here, so that the same code runs from a checkout and from a wheel.
+They are top-level folders of the repository, and a wheel carries them inside the package (`SHIPPED`). Every reader asks
+this module, so that the same code runs from a checkout and from a wheel.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ IS_INSTALLED = SHIPPED.is_dir()
 ROOT = SHIPPED if IS_INSTALLED else PACKAGE.parent
 ASSETS = ROOT / "assets"
 SPECS_VARIABLE = "TRAPS_SCENE_SPECS"  # names the folder of a sampled benchmark
-OWN_SPECS = ROOT / "scene_specs"  # those of this version of the code
+OWN_SPECS = ROOT / "scene_specs"  # the specs shipped with this version
 SCENE_SPECS = Path(os.environ.get(SPECS_VARIABLE) or OWN_SPECS).absolute()
 RELEASED = SCENE_SPECS / "released"
 CORRECTIONS = SCENE_SPECS / "corrections"
-# What commands write where they are told no folder: in the checkout, else below the current folder.
+# Default output of commands: in the checkout, else below the current folder.
 WORKSPACES = (Path.cwd() if IS_INSTALLED else ROOT) / ".workspaces"
 _NO_ADDRESS = re.compile(r"\?|%[0-9A-Fa-f]{2}")
 
 
 def user_cache() -> Path:
-    """Return the folder of this user for what can be made again."""
+    """Return this user's cache folder, for files that can be rebuilt."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "traps"
 
 
 def require_root() -> Path:
-    """Return the folder of `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is missing."""
+    """Return the folder of `assets/` and `scene_specs/`. Raises TrapsError with the remedy if one is missing."""
     for folder in (ASSETS, SCENE_SPECS):
         if not folder.is_dir():
             raise TrapsError(
@@ -43,10 +43,10 @@ def require_root() -> Path:
 
 
 def require_own(path: Path, instead: str) -> Path:
-    """Return the path, if people may change what lies there. `instead` says what to do where they may not.
+    """Return the path if it is the user's own to change.
 
-    Raises TrapsError for a file or folder of an installed wheel: the next installation would overwrite what was
-    written, and two studies would differ though they name the same version.
+    instead: what to do otherwise. Raises TrapsError for a file or folder of an installed wheel: the next installation
+    would overwrite the change, and two studies would differ although they name the same version.
     """
     if IS_INSTALLED and path.is_relative_to(SHIPPED):
         raise TrapsError(f"{path}: came with the installed package and is not changed; {instead}")
@@ -54,15 +54,17 @@ def require_own(path: Path, instead: str) -> Path:
 
 
 def require_own_corrections(folder: Path = CORRECTIONS) -> Path:
-    """Return the folder of corrections, if decisions may be written into it. Raises TrapsError."""
+    """Return the folder of corrections if decisions may be written into it. Raises TrapsError otherwise."""
     return require_own(
         folder, f"copy {OWN_SPECS} to a folder of your own, set {SPECS_VARIABLE} to it, and decide there"
     )
 
 
 def require_history_path(folder: Path) -> None:
-    """Raise TrapsError if Dagster cannot keep its history below a folder: it puts the path into an address, in which
-    `?` begins the parameters and `%41` is an A."""
+    """Raise TrapsError if Dagster cannot store its history below a folder.
+
+    Dagster puts the path into a URL, in which `?` begins the parameters and `%41` is an A.
+    """
     if match := _NO_ADDRESS.search(str(folder.absolute())):
         raise TrapsError(
             f"{str(folder)!r}: the path holds {match[0]!r}, below which Dagster cannot keep its history; choose a path "

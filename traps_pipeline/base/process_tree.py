@@ -1,8 +1,8 @@
-"""Processes that end together: a command and all that it started, and what they started, however each of them ends.
+"""Start processes that end together: a command and all its descendants, however each of them ends.
 
-A command that starts servers runs as two processes. The second one starts the servers and waits for them; the first
-one waits for the second. Each adopts the orphans below it (PR_SET_CHILD_SUBREAPER), so that it finds and ends what the
-death of the other one has left behind. Linux only; elsewhere the command is one process.
+A command that starts servers runs as two processes: the second starts the servers and waits for them, the first waits
+for the second. Each adopts the orphans below it (PR_SET_CHILD_SUBREAPER), so that it finds and stops what the death of
+the other one leaves running. Linux only; elsewhere the command is one process.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _PAUSE_S = 0.05
 def split(wait_s: float) -> int | None:
     """Fork a process that does the command's work; call it before any thread starts.
 
-    Returns None in that process, which gets a session of its own (Ctrl-C reaches it through the first process alone)
-    and SIGTERM when the first process dies. Returns its exit code in the first process, negative for the signal that
-    killed it, once it and everything below it has ended. KeyboardInterrupt in the first process stops it by SIGTERM,
-    after `wait_s` seconds or a second KeyboardInterrupt by SIGKILL, and passes through.
+    Return None in that process, which gets a session of its own (Ctrl-C reaches it through the first process alone) and
+    SIGTERM when the first process dies. In the first process, return the child's exit code (negative for the signal
+    that killed it) once it and everything below it has ended. KeyboardInterrupt in the first process stops the child by
+    SIGTERM, after `wait_s` seconds or a second KeyboardInterrupt by SIGKILL, and then propagates.
     """
     if sys.platform != "linux":
         return None
@@ -37,7 +37,7 @@ def split(wait_s: float) -> int | None:
         os.setsid()
         _prctl(_PR_SET_CHILD_SUBREAPER, 1)
         _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:  # it died before the call
+        if os.getppid() != parent:  # the parent died before the call
             raise KeyboardInterrupt
         return None
     try:
@@ -55,7 +55,7 @@ def split(wait_s: float) -> int | None:
 
 
 def wait_for(children: Collection[int]) -> tuple[int, int]:
-    """Return process id and exit code (negative: a signal's) of the first child to end; orphans are reaped."""
+    """Return process id and exit code (negative: a signal's) of the first child to end; reap orphans."""
     while True:
         pid, status = os.wait()
         if pid in children:
@@ -63,7 +63,7 @@ def wait_for(children: Collection[int]) -> tuple[int, int]:
 
 
 def stop_descendants(wait_s: float) -> None:
-    """End every process below this one: by SIGTERM, after `wait_s` seconds or at KeyboardInterrupt by SIGKILL."""
+    """Stop every process below this one by SIGTERM; after `wait_s` seconds or KeyboardInterrupt by SIGKILL."""
     try:
         pids = descendants()
         for pid in pids:
@@ -79,10 +79,10 @@ def stop_descendants(wait_s: float) -> None:
 
 
 def descendants() -> list[int]:
-    """Process ids of all that runs below this process, children of children included."""
+    """Return the ids of all processes below this one, grandchildren included."""
     children: dict[int, list[int]] = {}
     for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # the process has ended meanwhile
             parent = int((folder / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
             children.setdefault(parent, []).append(int(folder.name))
     below = list(children.get(os.getpid(), ()))

@@ -1,5 +1,8 @@
-"""Progress of a run: its state and the events that change it. Library code reports to `current()`; a command installs
-a subclass that prints (`cli/printed_progress.py`), and a Dagster step adds a listener (`Progress.heard_by`)."""
+"""The state of a run, and the events that change it.
+
+Library code reports to `current()`. A command installs a subclass that prints (`cli/printed_progress.py`), and a
+Dagster step adds a listener (`Progress.heard_by`).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ HEARTBEAT_S = 30.0  # between two lines about the same stage
 
 @dataclass
 class Tally:
-    """Work done, by kind."""
+    """Counts of work done, by kind."""
 
     asked: int = 0
     cached: int = 0
@@ -27,7 +30,7 @@ class Tally:
     frames: int = 0
 
     def add(self, other: Tally) -> None:
-        """Sum in place."""
+        """Add another tally in place."""
         self.asked += other.asked
         self.cached += other.cached
         self.errors += other.errors
@@ -36,7 +39,7 @@ class Tally:
 
 @dataclass
 class Traffic:
-    """Calls of a stage to one model or judge. Latencies are those of the last 500 calls, in seconds."""
+    """A stage's calls to one model or judge. Latencies are those of the last 500 calls, in seconds."""
 
     wanted: int = 0
     cached: int = 0
@@ -53,12 +56,12 @@ class Traffic:
         return self.done / max(time.monotonic() - self.began, 1e-9)
 
     def latency_s(self, share: float) -> float:
-        """Return the latency that this share of the last calls did not exceed."""
+        """Return the latency quantile of the last calls, in seconds. share: the quantile, from 0 to 1."""
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
 
     def figures(self) -> dict[str, float]:
-        """Return the figures by name, as a line of JSON has them."""
+        """Return the figures by name, for a line of JSON."""
         counts = {name: getattr(self, name) for name in ("done", "wanted", "cached", "errors", "retries")}
         pace = {"per_second": self.per_second, "p50_s": self.latency_s(0.5), "p95_s": self.latency_s(0.95)}
         return counts | {name: round(value, 3) for name, value in pace.items()} | {"usd": round(self.dollars, 6)}
@@ -66,8 +69,11 @@ class Traffic:
 
 @dataclass
 class StageProgress:
-    """The stage that runs: its partitions, and its calls by model or judge. detail: the unit in hand, `share` of which
-    is done. empty: partitions made without rows or files. cells: partitions whose calls are known."""
+    """The running stage: its partitions, and its calls by model or judge.
+
+    detail: the unit in progress, of which `share` is done. empty: partitions made without rows or files. cells:
+    partitions whose calls have been counted.
+    """
 
     name: str
     partitions: int
@@ -87,7 +93,7 @@ class StageProgress:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until the stage is done at its pace so far; None while nothing is known."""
+        """Seconds until the stage ends at its pace so far; None before anything is known."""
         total = self.total()
         begun = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
         return self.seconds / begun * max(self.partitions - begun, 0.0) if begun and self.partitions else None
@@ -102,13 +108,13 @@ class StageProgress:
         return total
 
     def work(self) -> list[str]:
-        """Return what the stage has done, in words."""
+        """Return the stage's work so far, in words."""
         words = {"asked": "asked", "cached": "from the ledger", "errors": "failed", "frames": "frames"}
         return [f"{count:,} {words[name]}" for name, count in vars(self.tally).items() if count]
 
 
 class Progress:
-    """The state of a run, without output but for notes. `totals` holds the work by stage."""
+    """The state of a run; prints nothing but notes. `totals` holds the work by stage."""
 
     def __init__(self) -> None:
         self.totals = dict[str, Tally]()
@@ -135,17 +141,17 @@ class Progress:
         self.changed()
 
     def helped(self, stage: str, tally: Tally) -> None:
-        """Count work for a partition that another run has made."""
+        """Count this run's share of a partition that another run finished."""
         self.totals.setdefault(stage, Tally()).add(tally)
 
     def tick(self, stage: str, what: str, done: int, total: int) -> None:
-        """Count units (clips, layers) of the partition in hand."""
+        """Count units (clips, layers) of the partition in progress."""
         if (now := self.current_stage) is not None:
             now.detail, now.share = f"{what}: {done:,} of {total:,}", done / max(total, 1)
         self.changed()
 
     def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:
-        """Count the calls of a cell before they are made: by model or judge, missing ones and those in the ledger."""
+        """Count a cell's calls before they are sent: by model or judge, new calls and those in the ledger."""
         if self.current_stage is None:
             self.current_stage = StageProgress(stage, 0)
         self.current_stage.cells += 1
@@ -156,7 +162,7 @@ class Progress:
         self.changed()
 
     def called(self, who: str, failed: bool, latency_s: float, dollars: float) -> None:
-        """Count a call that has come back for good."""
+        """Count a call that has finished, after its last retry."""
         self.spent_usd += dollars
         if traffic := self._traffic(who):
             traffic.done, traffic.errors = traffic.done + 1, traffic.errors + failed
@@ -165,17 +171,17 @@ class Progress:
         self.changed()
 
     def retried(self, who: str) -> None:
-        """Count a call that failed and is made again."""
+        """Count a failed call that is retried."""
         if traffic := self._traffic(who):
             traffic.retries += 1
         self.changed()
 
     def money(self, spent_usd: float, budget_usd: float) -> None:
-        """Set what the study has spent so far, and its budget (0: none)."""
+        """Set the study's spending so far, and its budget (0: none)."""
         self.spent_usd, self.budget_usd = spent_usd, budget_usd
 
     def end_stage(self) -> None:
-        """End the stage that runs, if any."""
+        """End the running stage, if any."""
         if (ended := self.current_stage) is not None:
             self.current_stage = None
             if ended.work():
@@ -187,11 +193,11 @@ class Progress:
         self.end_stage()
 
     def note(self, text: str) -> None:
-        """Tell a person something about the run."""
+        """Tell the user something about the run."""
         print(plain(text), file=sys.stderr)
 
     def changed(self) -> None:
-        """Tell the listeners of the stage that runs, at most every 30 s; called after each event."""
+        """Notify the stage's listeners, at most every 30 s; called after each event."""
         if self._listeners and time.monotonic() - self._heard_at >= HEARTBEAT_S:
             self._heard_at = time.monotonic()
             for listener in self._listeners:
@@ -201,7 +207,7 @@ class Progress:
 
     @contextmanager
     def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
-        """Give a listener a line about the stage that runs every 30 s, and one at its end, within the block."""
+        """Send a listener a line about the running stage every 30 s and one at its end, within the block."""
         self._listeners.append(listener)
         try:
             yield
@@ -209,7 +215,7 @@ class Progress:
             self._listeners.remove(listener)
 
     def figures(self) -> dict[str, Any]:
-        """Return the state by name, as a line of JSON has it."""
+        """Return the state by name, for a line of JSON."""
         money = {"spent_usd": round(self.spent_usd, 6), "budget_usd": self.budget_usd}
         if (now := self.current_stage) is None:
             return money
@@ -242,7 +248,7 @@ class Progress:
 
 
 def summary(stage: StageProgress) -> str:
-    """Return what a stage has done, on one line."""
+    """Return a stage's work on one line."""
     total = stage.total()
     retries = [f"{total.retries:,} retried"] if total.retries else []
     dollars = [f"${total.dollars:,.2f}"] if total.dollars else []
@@ -261,13 +267,13 @@ _current: list[Progress] = [Progress()]
 
 
 def current() -> Progress:
-    """Return the progress in force."""
+    """Return the active progress."""
     return _current[-1]
 
 
 @contextmanager
 def reporting(progress: AnyProgress) -> Iterator[AnyProgress]:
-    """Install a progress for the time of a block."""
+    """Make a progress the active one within the block."""
     _current.append(progress)
     try:
         yield progress

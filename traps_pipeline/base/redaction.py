@@ -1,9 +1,8 @@
-"""Remove keys from text before it is printed, logged, stored or shown.
+"""Remove keys from text before it is printed, logged, stored or displayed.
 
 Secrets are the values of environment variables that hold keys: those that a registry names (`hide`), those that a run
-has read (`remember`), and those whose names say so. They are found as they stand, in any case, escaped,
-percent-encoded, in base64 or in hexadecimal, also where white space, quotes or line breaks split them, and where either
-end is cut off.
+has read (`remember`), and those whose names say so. They are found verbatim, in any case, escaped, percent-encoded, in
+base64 or in hexadecimal, also when white space, quotes or line breaks split them, and when either end is cut off.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ SHORTEST = 8  # characters: anything shorter could be an ordinary word
 _PIECE = 6
 _NAMES = re.compile(r"(KEY|TOKEN|SECRET|PASSWORD|PASSWD)$", re.IGNORECASE)
 _PASSWORD = re.compile(r"://[^/\s:@]*:([^/\s@]+)@|\bpassword=([^\s&]+)")  # in an address of a database or a proxy
-_EXAMPLE = "PASSWORD"  # as our own sentences write addresses
+_EXAMPLE = "PASSWORD"  # placeholder in our own sentences
 _ENCODED = re.compile(
     r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%(?:25)*[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
     re.IGNORECASE,
 )
 _IGNORED = bytes((*range(33), 127, *b"\"'`\\|"))
 _VALUE = r"""(?=[^\s"'\\]*\d|[^\s"'\\]{16})[^\s"'\\,;&<>(){}\[\]]{6,}"""  # has a digit, or is longer than a word
-# Secrets that nobody named: in a header, a parameter or an address.
+# Secrets that no registry names: in a header, a parameter or an address.
 _UNKNOWN = re.compile(
     r"""((?:\b(?:authorization|[\w-]*(?:api[-_]?key|secret)|password)|[?&](?:key|sig|access_token))"""
     rf"""["'\\]*\s*[:=,]\s*b?["'\\]*(?:(?:bearer|basic)\s+)?|\b(?:bearer|basic)\s+){_VALUE}"""
@@ -60,7 +59,7 @@ def remember(value: str) -> None:
 
 
 def redact(text: str) -> str:
-    """Return the text with each secret in it replaced by `***`, known or recognizable by its header."""
+    """Return the text with each secret replaced by `***`, whether known or recognizable by its header."""
     if len(text) < SHORTEST:  # most cells of a table
         return text
     environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
@@ -80,8 +79,7 @@ def redact(text: str) -> str:
 
 
 def redact_tracebacks() -> None:
-    """Redact what this process logs, and the tracebacks and warnings that it prints: each may quote a request's
-    headers."""
+    """Redact this process's log records, tracebacks and warnings: each may quote a request's headers."""
     make = logging.getLogRecordFactory()
     if getattr(make, "__module__", "") == __name__:
         return
@@ -109,7 +107,7 @@ def redact_tracebacks() -> None:
 
 
 def redacted(error: Exception) -> Exception:
-    """Return an exception to raise in the place of one whose traceback would show a key; else the exception itself."""
+    """Return an exception to raise instead of one whose traceback would show a key; otherwise the exception itself."""
     text = "".join(traceback.format_exception(error))
     without = redact(text)
     return error if without == text else RuntimeError(without).with_traceback(error.__traceback__)
@@ -147,8 +145,7 @@ def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
 
 
 def _encoded(secret: str) -> Iterator[str]:
-    """Yield what base64 makes of a secret inside longer content, where it begins at one of three places of a group, and
-    what hexadecimal does."""
+    """Yield how a secret looks inside longer base64 content (at each of three offsets) and in hexadecimal."""
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
     for before, skipped in ((0, 0), (1, 2), (2, 3)):

@@ -1,4 +1,4 @@
-"""The nearest of the known words to one that is unknown, for error messages."""
+"""Suggest the known word nearest to an unknown one, for error messages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _LIKENESS = 0.6
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is most like this one, or None where none is like it."""
+    """Return the known word most similar to this one, or None if none is similar."""
     from difflib import get_close_matches
 
     names = {name.lower(): name for name in known}
@@ -17,6 +17,6 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return the end of a sentence that suggests the nearest known word, or nothing."""
+    """Return the end of a sentence that suggests the nearest known word; empty without one."""
     near = nearest(word, known)
     return f"; did you mean {near}?" if near else ""

@@ -1,4 +1,4 @@
-"""Text that others wrote, with hidden characters made visible, and tables for a terminal or a pipe."""
+"""Make hidden characters in untrusted text visible, and format tables for a terminal or a pipe."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _JOINER, _EMOJI_STYLE = "\u200d", "\ufe0f"
 
 
 def visible(text: str) -> str:
-    """Return the text with each character that is not seen, or that changes how others are shown, as `[U+202E]`.
+    """Return the text with each invisible or direction-changing character written as `[U+202E]`.
 
     Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
-    passes through here; the type (`Markup`) is kept.
+    passes through here; the type (`Markup`) is preserved.
     """
     return type(text)(_HIDDEN.sub(_number, text)) if _HIDDEN.search(text) else text
 
@@ -49,7 +49,7 @@ def finalized(value: object) -> object:
 
 
 def plain(text: object) -> str:
-    """Return text on one line that cannot steer a terminal and holds no key."""
+    """Return text on one line, without terminal control sequences and without keys."""
     return _printable(redact(str(text)))
 
 
@@ -58,9 +58,9 @@ def _printable(text: str) -> str:
 
 
 def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
-    """Return lines for a stream (default: standard output); on a terminal each is broken between words.
+    """Return lines for a stream (default: standard output), wrapped between words on a terminal.
 
-    hang: columns by which the rest of a line stands further in (default: 4 where the line is indented, else 0).
+    hang: extra indentation of continuation lines, in columns (default: 4 if the line is indented, else 0).
     """
     if not (stream or sys.stdout).isatty():
         return text
@@ -77,9 +77,9 @@ def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None)
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> str:
     """Return a table as lines of text for standard output; cells are untrusted.
 
-    The columns `left` (by place) are aligned to the left, the others to the right. On a terminal the headings are bold
-    with a rule below, and the last columns are left out and named where it is too narrow; elsewhere lines are plain,
-    with two spaces or more between columns. No cell is wrapped or cut.
+    The columns in `left` (by index) are left-aligned, the others right-aligned. On a terminal the headings are bold
+    above a rule, and if it is too narrow the last columns are left out and named. Elsewhere lines are plain, with two
+    or more spaces between columns. No cell is wrapped or cut.
     """
     from rich.box import SIMPLE_HEAD
     from rich.cells import cell_len

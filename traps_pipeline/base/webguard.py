@@ -1,8 +1,8 @@
-"""A guard before a web server of this machine, so that only the person who started it can use it.
+"""A guard in front of a local web server, so that only the person who started it can use it.
 
-A server takes any request that reaches its port: a page of another site, opened in the same browser, could act in the
-user's name. The guard lets through what carries the token of the address that was printed, comes from a page of this
-very server, and changes something by a POST of JSON only.
+A server accepts any request that reaches its port: a page of another site, opened in the same browser, could act in the
+user's name. The guard admits a request that carries the token of the printed address or comes from a page of this very
+server, and lets it change something only by a POST of JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 from traps_pipeline.base.errors import TrapsError
 
 LEAST_TOKEN = 16  # characters
-WHO = "traps.who"  # key of a request's scope: whose token it brought
+WHO = "traps.who"  # key of a request's scope: the owner of its token
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
 _OWN_SITE = (b"same-origin", b"none")
@@ -42,7 +42,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only programs of this machine reach what listens there."""
+    """Return whether a host is reachable only from this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -50,10 +50,10 @@ def is_loopback(host: str) -> bool:
 
 
 def token_for(host: str, token: str | None, *, danger: str, variable: str) -> str:
-    """Return the token of a server that listens there: the given one, or a fresh one. Raises TrapsError beyond this
-    machine without one, and for one that can be guessed.
+    """Return the token of a server on this host: the given one, or a fresh one.
 
-    danger: what everybody who reaches the address could do; variable: the environment variable that may hold a token.
+    Raises TrapsError for a server that others can reach without a token, and for a token that can be guessed. danger:
+    what everybody who reaches the address could do; variable: the environment variable that may hold a token.
     """
     if token is None and not is_loopback(host):
         raise TrapsError(
@@ -67,7 +67,7 @@ def token_for(host: str, token: str | None, *, danger: str, variable: str) -> st
 
 
 def public_name(address: str) -> str:
-    """Return name (and port) of the HTTPS server before this one. Raises TrapsError unless `https://NAME[:PORT]`."""
+    """Return name (and port) of the HTTPS proxy before this server. Raises TrapsError unless `https://NAME[:PORT]`."""
     parts = urlsplit(address)
     if parts.scheme != "https" or not parts.hostname or address.rstrip("/") != f"https://{parts.netloc}":
         raise TrapsError(
@@ -77,7 +77,7 @@ def public_name(address: str) -> str:
 
 
 def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
-    """Return a token of each person, made from one secret: the same after a restart, and telling nothing of another."""
+    """Return a token per person, derived from one secret: stable over restarts, and none reveals another."""
 
     def own(who: str) -> str:
         return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
@@ -86,11 +86,11 @@ def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
 
 
 class Guard:
-    """An ASGI app before another one.
+    """An ASGI app that guards another one.
 
-    token: the one token, or the person that each of several tokens belongs to; the app finds the person in the scope
-    under WHO. command: what printed the address, in words for who comes without its token. behind: the address of a
-    server with HTTPS that passes requests on, if there is one.
+    token: the only token, or several tokens with the person of each; the app finds the person in the scope under WHO.
+    command: the command that printed the address, for the message to visitors without a token. behind: the address of
+    an HTTPS proxy in front, if there is one.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Guard:
             self._names.add(public_name(behind))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through, or say in a sentence why not."""
+        """Admit a request, or answer with a sentence that says why not."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -162,7 +162,7 @@ class Guard:
         return self._owner(_given_token(scope)) is not None
 
     def _owner(self, token_given: str | None) -> str | None:
-        """Return whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
+        """Return the token's owner; None if nobody's. Compare with every token, so that timing reveals nothing."""
         owner = None
         for token, who in self._tokens.items():
             if token_given is not None and hmac.compare_digest(token_given.encode(), token.encode()):
@@ -170,7 +170,7 @@ class Guard:
         return owner
 
     def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
-        """Return whose cookie or `Authorization: Bearer TOKEN` a request brings; None where it is nobody's."""
+        """Return the owner of a request's cookie or `Authorization: Bearer TOKEN`; None if there is none."""
         scheme, _, token = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
         if scheme.lower() == "bearer":
             return self._owner(token.strip())
@@ -181,7 +181,7 @@ class Guard:
         return self._owner(cookies[self._cookie].value) if self._cookie in cookies else None
 
     async def _enter(self, scope: Scope, send: Send) -> None:
-        """Give the browser the token as a cookie and show the page without it: an address is seen and kept."""
+        """Set the token as a cookie and redirect to the page without it: an address is visible and recorded."""
         parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
         cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"

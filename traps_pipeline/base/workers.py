@@ -1,4 +1,4 @@
-"""One process a core for work that draws: results in the order of the jobs, workers recycled, nobody left behind."""
+"""Rendering workers, one process per core: results in job order, workers recycled, none left running."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class _Pool:
         self.executor.shutdown(wait=True, cancel_futures=True)
 
 
-_idle: list[_Pool] | None = None  # of `kept_workers`, what nobody uses now
+_idle: list[_Pool] | None = None  # idle pools of `kept_workers`
 
 
 @contextmanager
 def kept_workers() -> Iterator[None]:
-    """Keep workers for the next `run_in_order` in the block: to start one takes as long as to draw twenty frames."""
+    """Keep idle workers for the next `run_in_order` in the block: starting one takes as long as twenty frames."""
     global _idle
     if _idle is not None:
         yield
@@ -63,11 +63,12 @@ def run_in_order(
     ahead: int | None = None,
     at_once: bool = False,
 ) -> Iterator[tuple[Job, Result]]:
-    """Yield results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is
-    yielded, and no more than `ahead` at a time, for who may want no further result soon. at_once: the next job is taken
-    before a result is yielded, so that no worker waits for what the caller does with it.
+    """Yield results of a picklable function over jobs, in their order.
 
-    A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels what has not begun.
+    Jobs are taken lazily: a few ahead of the last yielded result, and at most `ahead` at a time, for callers that may
+    stop early. at_once: take the next job before a result is yielded, so that no worker waits while the caller uses it.
+
+    A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels pending jobs.
     """
     workers = workers or cores()
     most = min(2 * workers - 1, ahead or 2 * workers)

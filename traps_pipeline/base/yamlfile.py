@@ -1,5 +1,7 @@
-"""Files that people write, read strictly: YAML and JSON Lines give plain values or one sentence with file, line and
-complaint. What two readers could take for two things (a key twice, `yes`, `1:30`, `010`, `.inf`) is refused."""
+"""Read YAML and JSON Lines strictly: return plain values, or one sentence with file, line and complaint.
+
+Anything that two readers could read differently (a duplicate key, `yes`, `1:30`, `010`, `.inf`) is refused.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,7 @@ _Strict.add_constructor(f"{_TAG}float", _float)
 def _check_events(content: str) -> None:
     """Raise MarkedYAMLError for a tag, and for depth, nodes or aliases by which few lines could stand for millions."""
     nodes = aliases = 0
-    anchors = list[bool]()  # of the collections around an event, whether each has an anchor
+    anchors = list[bool]()  # for each collection around an event: whether it has an anchor
     for event in yaml.parse(content, Loader=_SAFE):
         if isinstance(event, yaml.CollectionEndEvent):
             anchors.pop()
@@ -119,7 +121,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def within(path: Path) -> Iterator[None]:
-    """Name the file in an error of the block that does not name it."""
+    """Add the file's name to errors of the block that do not name it."""
     try:
         yield
     except TrapsError as error:
@@ -137,7 +139,7 @@ def _said(error: Exception) -> str:
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the filled lines of a JSON Lines file, numbered from 1. Raises TrapsError, also for ambiguous JSON."""
+    """Yield the non-empty lines of a JSON Lines file, numbered from 1. Raises TrapsError, also for ambiguous JSON."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
@@ -149,7 +151,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _check_line(line: str, where: str) -> None:
-    """Raise TrapsError for JSON that is ambiguous or without a bound. What is no JSON is left to the reader."""
+    """Raise TrapsError for ambiguous or unbounded JSON. Invalid JSON is left to the reader."""
     try:
         if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:
             raise _Odd("too large, or nested too deeply")
@@ -166,7 +168,7 @@ def _check_line(line: str, where: str) -> None:
 
 
 class _Odd(Exception):
-    """What a line holds that it must not."""
+    """A value that a line must not contain."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -185,7 +187,7 @@ def _finite(text: str) -> float:
 
 
 def _depth(line: str) -> int:
-    """Return how deep brackets outside strings are nested; fast, since every command reads some megabytes."""
+    """Return the nesting depth of brackets outside strings; fast, since every command reads some megabytes."""
     outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
     brackets = outside.encode().translate(None, _NO_BRACKETS)
     return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
@@ -205,7 +207,7 @@ def parse_yaml_model(
 
 
 def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
-    """Yield values that a model took for another kind: true for 1, a text for a number; and no numbers."""
+    """Yield values that a model converted to another type (true to 1, a text to a number), and non-finite numbers."""
     if isinstance(validated, float) and not math.isfinite(validated):
         yield f"{name}: {validated} is no finite number"
     number = isinstance(validated, int | float) and not isinstance(validated, bool)
@@ -224,7 +226,7 @@ def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Return a validation error in one line, `field: complaint`, with the known field that an unknown one resembles."""
+    """Return a validation error on one line, `field: complaint`, with the known field nearest to an unknown one."""
     parts = list[str]()
     for each in error.errors():
         field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")
@@ -236,7 +238,7 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
 
 
 def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
-    """Return the names of the fields of a model, or of the model within it that lies at a place; [] if none does."""
+    """Return the field names of a model, or of the nested model at `place`; [] if there is none."""
     for step in place:
         field = model.model_fields.get(str(step))
         if field is None:  # a number in a list, a name in a mapping or of a union's member

@@ -1,1 +1,1 @@
-"""The benchmark as data: released records, corrections folded over them, versions, items."""
+"""The benchmark as data: released records, corrections, versions and items."""

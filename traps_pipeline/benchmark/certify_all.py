@@ -1,4 +1,4 @@
-"""Certifying a whole benchmark: all records on all cores, resumable, and the table of what was found."""
+"""Certify a whole benchmark: all records on all cores, resumable, with a table of results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.benchmark.composition import load_composition, problems
-from traps_pipeline.benchmark.foretelling import AT_MOST, FEWEST, foretold
+from traps_pipeline.benchmark.outcome_leakage import AT_MOST, FEWEST, outcome_leakage
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -27,7 +27,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 @dataclass(frozen=True)
 class Case:
-    """A record to certify, its trajectories' file, and where its verdict is kept."""
+    """A record to certify, its trajectories' file, and the file for its verdict."""
 
     spec: SceneSpec
     trajectory: Path
@@ -45,7 +45,7 @@ def certify_all(
 ) -> tuple[list[Verdict], list[str]]:
     """Return verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
 
-    Verdicts are kept under `kept` by record and code, so that a stopped call goes on where it was.
+    Verdicts are cached under `kept` by record and code, so that an interrupted call resumes.
     """
     released = folder / "released"
     specs = [s for s in load_released(released).values() if families is None or s.family in families]
@@ -75,14 +75,14 @@ def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
 
 @cache
 def code_digest(family: str) -> str:
-    """Return the digest of the code that certifies a family: verdicts of other code are not believed."""
+    """Return the digest of the code that certifies a family; cached verdicts of other code are ignored."""
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])
 
 
 def judge(case: Case) -> Verdict:
-    """Return the verdict on one record, from its file if it is known."""
+    """Return the verdict on one record, from its file if it is cached."""
     if case.verdict.is_file():
         return Verdict(**json.loads(case.verdict.read_text(encoding="utf-8")))
     spec = case.spec
@@ -109,7 +109,7 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Return families of cut clips, of a hundred records or more, whose outcomes the state at the cut foretells."""
+    """Return families of cut clips, with at least a hundred records, whose state at the cut predicts the outcome."""
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
@@ -119,19 +119,24 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
     for family, members in families.items():
         outcomes = [spec.ground_truth for spec in members]
         predicted = (
-            foretold([states[spec.scenario_id] for spec in members], outcomes) if len(members) >= FEWEST else None
+            outcome_leakage([states[spec.scenario_id] for spec in members], outcomes)
+            if len(members) >= FEWEST
+            else None
         )
         if predicted is not None and predicted.gain > AT_MOST:
             problems.append(
-                f"{family}: the state at the cut foretells {predicted.best:.3f} of the outcomes, the commonest one is "
+                f"{family}: the state at the cut predicts {predicted.best:.3f} of the outcomes, the commonest one is "
                 f"{predicted.prior:.3f}; at most {AT_MOST} more is allowed"
             )
     return problems
 
 
 def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
-    """Return one line a family: scenarios, passed, draws rejected, entropy of the futures and how often the best guess
-    at them is right, margins, twins, CPU seconds."""
+    """Return a table as lines of text, one line per family.
+
+    Columns: scenarios, passed, rejected draws, entropy of the futures and accuracy of the best guess, margins, twins,
+    CPU seconds.
+    """
     tallies = load_tallies(folder / "released")
     members: defaultdict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:

@@ -1,4 +1,4 @@
-"""A whole benchmark: how many scenarios of each family, drawing one, and what must hold across scenarios."""
+"""A whole benchmark: the number of scenarios of each family, sampling, and checks across scenarios."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic 
 
 
 class Composition(RootModel[dict[str, int]]):
-    """Family to number of scenarios."""
+    """The number of scenarios of each family."""
 
 
 def load_composition(path: Path = SCENE_SPECS / "composition.yaml") -> dict[str, int]:
-    """Return scenarios of each family. Raises TrapsError naming the file."""
+    """Return the number of scenarios of each family. Raises TrapsError naming the file."""
     try:
         return Composition.model_validate(read_yaml(path)).root
     except ValidationError as error:
@@ -44,10 +44,10 @@ def sample_benchmark(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Draw a benchmark into `out`: released records, trajectories, `benchmark.yaml` with a canary of its own.
+    """Sample a benchmark into `out`: released records, trajectories, `benchmark.yaml` with its own canary.
 
-    What is there of the same seed and numbers stays: a stopped sampling goes on. Raises TrapsError when a family cannot
-    be filled.
+    Existing records of the same seed and numbers stay: an interrupted sampling resumes. Raises TrapsError if a family
+    cannot be filled.
     """
     with kept_workers():
         for family, count in counts.items():
@@ -63,9 +63,9 @@ def sample_benchmark(
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Return what is wrong with a set of records as a whole; one sentence each, naming the family.
+    """Return problems of a set of records as a whole; one sentence each, naming the family.
 
-    counts: the wanted number of scenarios of each family; not checked if None.
+    counts: the required number of scenarios of each family; not checked if None.
     """
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
@@ -106,7 +106,7 @@ def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
 
 
 def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    """Return a distance from another outcome that is the same in every scene is no distance: nothing is measured."""
+    """Return a problem if a margin is the same in every scene: then nothing was measured."""
     margins = {spec.evidence.get("margin_m") for spec in members}
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
@@ -127,7 +127,7 @@ def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
-    """Return accuracy of always giving a sub-scenario's commonest answer; occlusion and chaotic weighted equally."""
+    """Return the accuracy of always giving a sub-scenario's commonest answer; taxonomies weighted equally."""
     commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
     shares = []
     for taxonomy in ("occlusion", "chaotic"):

@@ -56,16 +56,16 @@ class Correction(BaseModel):
     why: str = Field(min_length=1)
 
     def changes(self) -> dict[str, Any]:
-        """Return what the decision rewrites: words, answer, params."""
+        """Return the fields that the decision rewrites: words, answer, params."""
         fields = (*WORDS, "answer", "params")
         return {f: v for f, v in self.model_dump(mode="json", include=set(fields)).items() if v is not None}
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after folding: the released record (None for an added one) and what corrections changed.
+    """A scenario after its corrections: the released record (None for an added one) and its changes.
 
-    `params` is not None when the scene itself has to be resolved anew; that is left to the scene_specs stage.
+    `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
 
     scenario_id: str
@@ -83,14 +83,14 @@ class Scenario:
         return digest([base, dict(self.words), dict(self.params) if self.params is not None else None])[:16]
 
     def changed_words(self) -> SceneSpec:
-        """Return the released record with the words of the corrections. Raises TrapsError naming the correction."""
+        """Return the released record with the corrected words. Raises TrapsError naming the correction."""
         if self.released is None:
             raise ValueError(f"{self.scenario_id} was added; it has no released record")
         return apply_words(self.released, self.words, self.where)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
-    """Return a record with other words; labels and answer are checked against each other. Raises TrapsError."""
+    """Return a record with other words, after checking labels and answer against each other. Raises TrapsError."""
     if not words:
         return spec
     record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}
@@ -121,7 +121,7 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
 
 
 def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Correction]]) -> dict[str, Scenario]:
-    """Return the benchmark after all decisions, by scenario id in sorted order. Raises TrapsError naming the line."""
+    """Return the benchmark after all decisions, by scenario id, sorted. Raises TrapsError naming the line."""
     scenarios = {
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
@@ -196,14 +196,16 @@ def _added(where: str, correction: Correction) -> Scenario:
 
 
 def load_scenarios(study: Study) -> dict[str, Scenario]:
-    """Return the scenarios of a study: folded, then the study's subset. Raises TrapsError for an unknown named
-    scenario."""
+    """Return the scenarios of a study: with corrections, then limited to its subset.
+
+    Raises TrapsError for an unknown named scenario.
+    """
     check_benchmark(study)
-    return subset(folded(), study)
+    return subset(corrected_scenarios(), study)
 
 
 def check_benchmark(study: Study) -> None:
-    """Raise TrapsError unless the records in force are of the study's benchmark."""
+    """Raise TrapsError unless the active records are of the study's benchmark."""
     current = "released" if SCENE_SPECS == OWN_SPECS else load_release().name
     if study.benchmark != current:
         raise TrapsError(
@@ -213,20 +215,22 @@ def check_benchmark(study: Study) -> None:
 
 
 def _elsewhere(benchmark: str) -> str:
-    """Return where the records of a benchmark are looked for, as a thing to do."""
+    """Return where to look for the records of a benchmark, as an instruction."""
     released = benchmark == "released"
     return f"unset {SPECS_VARIABLE}" if released else f"set {SPECS_VARIABLE} to the folder of {benchmark!r}"
 
 
 @cache
-def folded() -> dict[str, Scenario]:
+def corrected_scenarios() -> dict[str, Scenario]:
     """Return the released records after all corrections."""
     return fold(load_released(), read_corrections())
 
 
 def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenario]:
-    """Return named scenarios, or the first n of each family, or all. Discarded ones fall away; no other takes their
-    place."""
+    """Return the study's named scenarios, or the first n of each family, or all.
+
+    Discarded scenarios are left out without replacement.
+    """
     if study.scenarios is not None:
         unknown = sorted(set(study.scenarios) - set(scenarios) - _ever_known())
         if unknown:

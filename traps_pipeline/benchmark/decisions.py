@@ -1,8 +1,8 @@
-"""Review decisions as they are made: appended to the corrections, one after another, whoever makes them.
+"""Append review decisions to the corrections, safely for several reviewers at once.
 
-The append-only file is the only store. A decision is checked by folding it over all that stand before it, written at
-once and brought to the disk before it is confirmed; so a kill between two decisions loses none that was confirmed, and
-of several reviewers at once each appends behind the other.
+The append-only file is the only store. A decision is checked by folding it over all earlier ones, written at once and
+synced to disk before it is confirmed; so a kill loses no confirmed decision, and concurrent reviewers append one after
+the other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
 from traps_pipeline.base.paths import CORRECTIONS, require_own_corrections
-from traps_pipeline.benchmark.corrections import Correction, Scenario, fold, folded, read_corrections
+from traps_pipeline.benchmark.corrections import Correction, Scenario, corrected_scenarios, fold, read_corrections
 from traps_pipeline.benchmark.records import load_released
 
 FILE = "review.jsonl"
@@ -27,24 +27,24 @@ Signed = Callable[..., Correction]
 
 
 class DecidedMeanwhile(TrapsError):
-    """Somebody else decided about the scenario since the reviewer looked at it."""
+    """Another reviewer has decided about the scenario since this one looked at it."""
 
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
-    """Return all decisions about a scenario, in order. Raises TrapsError for a file that cannot be read."""
+    """Return all decisions about a scenario, in order. Raises TrapsError for an unreadable file."""
     return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
 
 
 def is_reviewed(decisions: Sequence[Correction]) -> bool:
-    """Return whether the last decision about a scenario stands: `restore` takes back those before it."""
+    """Return whether the last decision about a scenario is valid: `restore` takes back those before it."""
     return bool(decisions) and decisions[-1].action != "restore"
 
 
 def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> None:
-    """Append a decision. seen: how many decisions about the scenario the reviewer knew of.
+    """Append a decision. seen: the number of decisions about the scenario that the reviewer knew of.
 
-    Raises DecidedMeanwhile where there are more by now, and TrapsError where the decision does not fit the record;
-    nothing is written then.
+    Raises DecidedMeanwhile if there are more by now, and TrapsError if the decision does not fit the record; nothing is
+    written then.
     """
     with _appending(folder) as append:
         _require_known(correction.scenario_id, seen, folder)
@@ -52,9 +52,9 @@ def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> Non
 
 
 def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
-    """Take back the last decision about a scenario, by further decisions that bring back what was before it.
+    """Take back the last decision about a scenario, by appending decisions that restore the former state.
 
-    Raises DecidedMeanwhile as `decide` does, and TrapsError where there is nothing to take back.
+    Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
     with _appending(folder) as append:
         own = _require_known(scenario_id, seen, folder)
@@ -72,10 +72,10 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
 
 
 def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
-    """Return the decisions after which a scenario is as it was before, and reviewed only if it was."""
+    """Return the decisions that restore a scenario's former state, reviewed only if it was."""
     if not is_released:
         if before is None:
-            return [signed("discard")]  # it had been added
+            return [signed("discard")]  # undo an addition
         changes = {**before.words, "params": dict(before.params or {})}
         return [signed("correct", **changes)]
     steps = [signed("restore")]
@@ -98,8 +98,10 @@ def _require_known(scenario_id: str, seen: int, folder: Path) -> list[Correction
 
 @contextmanager
 def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
-    """Return what appends decisions, while no other process does. Raises TrapsError where a later file would overrule
-    them, and where the folder belongs to an installed wheel."""
+    """Yield a function that appends decisions, while no other process does.
+
+    Raises TrapsError if a later file would overrule them, and if the folder belongs to an installed wheel.
+    """
     require_own_corrections(folder).mkdir(parents=True, exist_ok=True)
     later = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
     if later:
@@ -122,13 +124,13 @@ def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]
             os.fsync(stream.fileno())
             if is_new:
                 sync_folder(folder)
-            folded.cache_clear()
+            corrected_scenarios.cache_clear()
 
         yield append
 
 
 def _cut_torn_line(stream: Any) -> None:
-    """Remove what a power cut left of a line that was never confirmed."""
+    """Remove the remains of an unconfirmed line after a power cut."""
     stream.seek(0)
     content = stream.read()
     end = content.rfind(b"\n") + 1

@@ -1,4 +1,4 @@
-"""The arms stage: of each scenario the arms that the study asks for, filmed and certified once (docs/arms.md)."""
+"""The arms stage: render and certify, once, the arms that the study asks for of each scenario (docs/arms.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
-from traps_pipeline.benchmark.corrections import folded
+from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.versions import clip_content, version_of
@@ -34,13 +34,13 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
 KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, GRADED: GRADED_CUT, **VARIATIONS}
-SECONDS_AN_ARM = 2.0  # of one core, in the mean: one is a clip, or two questions, or a proof that it is refused
-_FOUND = ".arm.json"  # how the files end that say what came of an arm
+SECONDS_AN_ARM = 2.0  # mean of one core per arm, which is a clip, or two questions, or a proof that it is refused
+_FOUND = ".arm.json"  # suffix of the files with an arm's result
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What came of an arm of a scenario, as it is kept beside its clip. of: the record and the code that it is of."""
+class ArmResult:
+    """The stored result of an arm of a scenario, beside its clip. of: the digest of the record and the code."""
 
     of: str
     refused: str | None
@@ -48,17 +48,17 @@ class Finding:
     frames: int = 0
 
     @staticmethod
-    def read(path: Path, of: str) -> Finding | None:
-        """Return what is kept, if it is of this record and this code."""
+    def read(path: Path, of: str) -> ArmResult | None:
+        """Return the stored result if it is of this record and this code, else None."""
         if not path.is_file():
             return None
-        finding = Finding(**json.loads(path.read_text(encoding="utf-8")))
+        finding = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
         return finding if finding.of == of else None
 
 
 @dataclass(frozen=True)
 class Job:
-    """Arms of one scenario that are still to be filmed: arm -> its clip. Trajectories are (F, nq)."""
+    """The arms of one scenario still to be rendered: arm -> its clip. Trajectories are (F, nq)."""
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -67,14 +67,16 @@ class Job:
 
 
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
-    """Return the arms and variations of a category's scenarios that some experiment of the study asks for."""
+    """Return the arms and variations of a category that some experiment of the study requests."""
     datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
     return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in datasets]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Film and certify what is missing of a category's arms, beside whoever else does so; what `share` returns. Raises
-    TrapsError."""
+    """Render and certify the missing arms of a category, concurrently with other processes.
+
+    Return the result of `share`. Raises TrapsError.
+    """
     specs, arms = _specs(workspace, category), asked_arms(workspace, category)
 
     def files(row: Row) -> list[Path]:
@@ -101,7 +103,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate how long one core films what is missing of a category's arms, as far as released records tell."""
+    """Estimate one core's time to render the missing arms of a category, as far as released records tell."""
     clips = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()
@@ -111,8 +113,10 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
-    """Return rows of the category's arms, all of which were filmed. Raises TrapsError for one that was not, and for a
-    damaged clip."""
+    """Return rows of the category's arms.
+
+    Raises TrapsError for an arm that was not rendered, and for a damaged clip.
+    """
     specs, arms = _specs(workspace, category), asked_arms(workspace, category)
     of_pairs = {
         (row["scenario_id"], row["side"]): row
@@ -140,10 +144,10 @@ def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Pat
 
 
 def _missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
-    """Return whether the study lacks something of these arms of a scenario."""
+    """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
-        finding = Finding.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in existing else None
+        finding = ArmResult.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in existing else None
         if finding is None or (finding.frames and not {clip, note_of(clip)} <= existing):
             return True
     return False
@@ -154,26 +158,26 @@ def _finding_of(clip: Path) -> Path:
 
 
 def _files(clip: Path) -> tuple[Path, ...]:
-    """Return the files of an arm: its clip with the note, which a refused one has not, and what was found."""
+    """Return the files of an arm: its clip with the note (none if it was refused), and the result."""
     return clip, note_of(clip), _finding_of(clip)
 
 
 @cache
 def _code(arm: str) -> str:
-    """Return the code that films an arm or a variation: after a change of it, it is filmed anew."""
+    """Return the code version of an arm or a variation; a change of it causes a new rendering."""
     name = GRADED if arm == GRADED else "arms" if arm in ARM_NAMES else "variations"
     return file_digest(PACKAGE / "scenes" / "variants" / f"{name}.py")
 
 
 def arm_of(spec: SceneSpec, arm: str) -> Arm:
-    """Return the arm or variation of a scenario, which crosses its questions with its partner's in the benchmark."""
+    """Return the arm or variation of a scenario, with its partner in the benchmark for crossed questions."""
     return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else KNOWN[arm]
 
 
 @cache
 def _partners(family: str) -> dict[str, SceneSpec]:
-    """Return the partners of a family's scenarios. A scenario whose scene was corrected or added has none."""
-    members = [one for one in folded().values() if one.family == family]
+    """Return the partners of a family's scenarios. A scenario with a corrected or added scene has none."""
+    members = [one for one in corrected_scenarios().values() if one.family == family]
     specs = {one.scenario_id: one.changed_words() for one in members if one.released and one.params is None}
     return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
 
@@ -184,13 +188,13 @@ def _of(spec: SceneSpec, arm: str) -> str:
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
-    """Return whether an arm lies here as it was made, with its clip where it has one. Raises DamagedClip."""
-    finding = Finding.read(_finding_of(clip), _of(spec, arm))
+    """Return whether an arm lies here complete, with its clip if it has one. Raises DamagedClip."""
+    finding = ArmResult.read(_finding_of(clip), _of(spec, arm))
     return finding is not None and (not finding.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
-    """Film and certify what is missing of a scenario; returns the number of frames drawn into clips."""
+    """Render and certify the missing arms of a scenario; return the number of rendered frames."""
     scenario, drawn = Scenario.of_record(job.spec, job.qpos, job.twin), 0
     for arm, clip in job.clips.items():
         of = _of(job.spec, arm)
@@ -200,9 +204,9 @@ def film(job: Job) -> int:
             take = known.film(scenario)
             if take.frames:
                 drawn += save_clip(clip, take.frames, scenario.fps)
-            finding = Finding(of, None, take.evidence, len(take.frames))
+            finding = ArmResult(of, None, take.evidence, len(take.frames))
         except Rejected as why:
-            finding = Finding(of, str(why), {})
+            finding = ArmResult(of, str(why), {})
         write_text(_finding_of(clip), json.dumps(asdict(finding)))
     return drawn
 
@@ -217,7 +221,7 @@ def _rows(
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = Finding.read(_finding_of(path), _of(spec, arm)), known.get(path)
+    finding, clip = ArmResult.read(_finding_of(path), _of(spec, arm)), known.get(path)
     if finding is None or (finding.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(
@@ -274,8 +278,7 @@ def _shown_in_pair(row: Row) -> dict[str, Any]:
 
 
 def unmade(workspace: Workspace, category: str) -> list[str]:
-    """Return why a category's table is not all that the study asks for: an arm that was not asked for then, a lost
-    clip."""
+    """Return why a category's table is incomplete: an arm that was requested later, or a lost clip."""
     table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     present = set(table["arm"])
     reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]

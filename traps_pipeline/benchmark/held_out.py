@@ -1,4 +1,4 @@
-"""The key of a held-out set: under it items have names that tell nothing, and only its owner can say which is which."""
+"""The key of a held-out set, whose items have opaque names that only the key's owner can resolve."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ KEY_BYTES = 32
 
 
 def opaque(key: bytes, item_id: str) -> str:
-    """Return the name of a held-out item: without the key nobody can say which item it is."""
+    """Return the name of a held-out item; without the key nobody can tell which item it is."""
     return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
 
 
 def held_out_key(path: Path, *, make: bool = False) -> bytes:
-    """Return the key of a held-out set, from its file of 64 hexadecimal digits; a missing one is drawn and written,
-    readable by its owner alone. Raises TrapsError."""
+    """Return the key of a held-out set, from its file of 64 hexadecimal digits.
+
+    A missing file is created with a random key, readable by its owner alone. Raises TrapsError.
+    """
     if make and not path.exists():
         write_text(path, secrets.token_hex(KEY_BYTES) + "\n")
         path.chmod(0o600)

@@ -1,4 +1,4 @@
-"""The items stage: scenarios and clips to the questions put to models, two a pair (docs/spec.md 1 and 2)."""
+"""The items stage: turn scenarios and clips into questions to models, two per pair (docs/spec.md 1 and 2)."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ Record = Mapping[str, Any]
 
 
 def categories_of_dataset(dataset: str) -> list[str]:
-    """Return the categories whose scenarios make a dataset."""
+    """Return the categories whose scenarios form a dataset."""
     return [category for category in ALL_CATEGORIES if dataset in all_datasets_of(category)]
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
-    """Return rows of a dataset's items. Clips are checked against their digests. Raises TrapsError."""
+    """Return rows of a dataset's items, after comparing clips with their digests. Raises TrapsError."""
     specs: list[Record] = []
     clips: dict[tuple[str, str], Record] = {}
     for category in categories_of_dataset(dataset):
@@ -61,10 +61,10 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
 
 
 def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return the items of a dataset that a run would make now, as far as the clips that exist tell; nothing is made.
+    """Return the items that a run would build for a dataset now, without building anything.
 
-    Left out are items whose clip must be rendered first and, of arms, those of scenarios that have changed. Raises
-    TrapsError.
+    It uses the clips that exist: items whose clip must be rendered first are left out, and of arms those of changed
+    scenarios. Raises TrapsError.
     """
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in BESIDE:
@@ -86,7 +86,7 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 def _of_arm(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
-    """Return items of an arm: of each scenario that admits it, what the arms table asks."""
+    """Return items of an arm: the questions of the arms table, for each scenario that admits the arm."""
     rows = []
     for category in categories_of_dataset(arm):
         if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
@@ -126,7 +126,7 @@ def answer_type_of(labels: Sequence[str]) -> str:
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
-    """Return the commonest control answer of each sub-scenario; the first in alphabetical order where several are."""
+    """Return the commonest control answer of each sub-scenario; of equally common ones the alphabetically first."""
     counts: dict[str, Counter[str]] = {}
     for spec in specs:
         counts.setdefault(spec["sub_scenario"], Counter())[spec["ground_truth"]] += 1
@@ -185,7 +185,7 @@ def _decisive(
     control_answer: str,
     media_digest: str,
 ) -> dict[str, Any]:
-    """Return all of an item that decides its answer or its score."""
+    """Return every property of an item that decides its answer or its score."""
     return {
         "item_id": f"{dataset}:{spec['scenario_id']}:{side}",
         "pair_id": f"{dataset}:{spec['scenario_id']}",
@@ -212,7 +212,7 @@ _DECISIVE = (
 
 
 def item_hash(row: Record) -> str:
-    """Return the digest of all of an item that decides its answer or its score."""
+    """Return the digest of every property of an item that decides its answer or its score."""
     decisive = {name: row[name] for name in _DECISIVE}
     return digest(decisive | {"labels": list(row["labels"]), "aliases": json.loads(row["aliases"])})
 

@@ -1,4 +1,4 @@
-"""Released records: `scene_specs/released/*.jsonl`, one fully resolved scenario a line, and the benchmark's name."""
+"""Released records: `scene_specs/released/*.jsonl`, one fully resolved scenario per line, and the benchmark's name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 class Release(BaseModel):
-    """`scene_specs/benchmark.yaml`: what the released records are called, and a canary for contamination checks."""
+    """The contents of `scene_specs/benchmark.yaml`: the release's name, and a canary for contamination checks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name
@@ -28,13 +28,13 @@ class Release(BaseModel):
 
 @cache
 def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
-    """Name and version of the released benchmark."""
+    """Return name and version of the released benchmark."""
     return parse_yaml_model(Release, read_yaml(path), path)
 
 
 @cache
 def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
-    """Return all released records by scenario id. Raises TrapsError naming file, line and what to do."""
+    """Return all released records by scenario id. Raises TrapsError naming file, line and remedy."""
     records: dict[str, SceneSpec] = {}
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
@@ -52,7 +52,7 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 
 def parse_record(line: str, where: str) -> SceneSpec:
-    """Return one line of a released file. Raises TrapsError."""
+    """Return the record of one line of a released file. Raises TrapsError."""
     try:
         spec = SceneSpec.model_validate(json.loads(line))
     except ValidationError as error:

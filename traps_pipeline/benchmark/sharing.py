@@ -1,7 +1,7 @@
-"""Clips of a category that several processes make beside one another, on one host or on many, a scenario each.
+"""Share the rendering of a category's clips between processes, on one host or many, one scenario at a time.
 
-All go through the same rows. Each leases one that nobody has, makes what is missing of it, hands it over to the study
-and goes on to the next; whoever dies gives its rows back. Nobody is done before all clips are there.
+All processes go through the same rows. Each leases a free row, makes its missing clips, publishes them to the study and
+goes on to the next. Leases of dead processes expire. `share` returns when every clip exists.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Job = TypeVar("Job")
 
 @dataclass(frozen=True)
 class Filming(Generic[Job]):
-    """What is made of rows of scene_specs.
+    """The work to do for rows of scene_specs.
 
-    name: of the work, the same wherever it is done. missing: those rows of which the study lacks something. files: what
-    the study has of a row once it is made. job: what must be drawn of a row (None: nothing), once what there is of it
-    was brought here. draw: draws it, in a process of its own; returns how many frames are new.
+    name: of the work, the same on every host. missing: returns the rows with missing files. files: the study's files of
+    a finished row. job: returns what to draw for a row (None: nothing), after existing files were fetched. draw: draws
+    it, in a process of its own, and returns the number of new frames.
     """
 
     name: str
@@ -44,9 +44,12 @@ class Filming(Generic[Job]):
 def share(
     store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
 ) -> tuple[int, bool]:
-    """Make what is missing of rows, beside whoever else does so: the frames that were drawn here, and whether all is
-    there. wait: return only then; else as soon as others are at all that is missing. tick: gets the number of rows that
-    are there. Raises TrapsError, also for a damaged clip."""
+    """Make the missing files of rows, concurrently with other processes.
+
+    Return the number of frames drawn here, and whether all files exist. wait: return only then; otherwise as soon as
+    other processes hold everything that is missing. tick: receives the number of finished rows. Raises TrapsError, also
+    for a damaged clip.
+    """
     try:
         return _Sharing(store, rows, of, tick).work(wait=wait)
     except DamagedClip as error:
@@ -57,7 +60,7 @@ class _Sharing(Generic[Job]):
     def __init__(self, store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None]) -> None:
         self._store, self._of, self._tick = store, of, tick
         missing = {id(row) for row in of.missing(rows)}
-        # By number, which is the same for everybody.
+        # By number, which is the same in every process.
         self._left = {number: row for number, row in enumerate(rows) if id(row) in missing}
         self._done = len(rows) - len(self._left)
         self._drawing = deque[tuple[Row, Lease]]()  # in the order of the jobs
@@ -66,13 +69,13 @@ class _Sharing(Generic[Job]):
         n_frames = 0
         try:
             while self._left:
-                # The next row is drawn while files are handed over, and is leased no sooner.
+                # Draw the next row while files are published, and do not lease it earlier.
                 for _, frames in run_in_order(self._of.draw, self._jobs(), at_once=True):
                     n_frames += frames
                     self._finish(*self._drawing.popleft())
                 if not wait:
                     break
-                if self._left:  # nothing of one's own is under way, or two might wait for one another
+                if self._left:  # wait only without a job in progress, or two processes might wait for each other
                     time.sleep(POLL_S)
         finally:
             for _, lease in self._drawing:
@@ -80,14 +83,14 @@ class _Sharing(Generic[Job]):
         return n_frames, not self._left
 
     def _jobs(self) -> Iterator[Job]:
-        """Yield jobs of the rows that nobody else has, each leased when its job is asked for."""
+        """Yield jobs of the rows that no other process holds, each leased when its job is requested."""
         for number in [*self._left]:
             lease = self._store.lease(f"{self._of.name}/{number:06d}")
             if lease is None:
                 continue
             row = self._left.pop(number)
             self._drawing.append((row, lease))
-            self._store.look()  # another process may have made it
+            self._store.look()  # another process may have finished it
             job = None
             if self._of.missing([row]):
                 self._store.bring(self._of.files(row))
@@ -98,7 +101,7 @@ class _Sharing(Generic[Job]):
                 yield job
 
     def _finish(self, row: Row, lease: Lease) -> None:
-        """Hand a row's files over to the study, and give it back."""
+        """Publish a row's files to the study, and release its lease."""
         with closing(lease):
             self._store.keep(file for file in self._of.files(row) if file.is_file())
         self._done += 1
@@ -106,8 +109,7 @@ class _Sharing(Generic[Job]):
 
 
 def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """Return what is known of those clips that are there; none of them is fetched for it. Raises DamagedClip where one
-    is not what its note says."""
+    """Return the notes of existing clips, without fetching a clip. Raises DamagedClip if one differs from its note."""
     paths = [*clips]
     store.bring(map(note_of, paths))
     digests = store.digests(paths)

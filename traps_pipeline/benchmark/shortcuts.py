@@ -1,7 +1,8 @@
-"""How well control and void can be told apart without looking at what happens: a question's wording, a clip's length,
-its first frame, its file size. Reported beside the observer, and no gate: a cut clip *is* shorter.
+"""Measure how well superficial cues tell control from void: a question's wording, a clip's length, first frame, file
+size.
 
 A model that abstained on such a cue alone would score without having seen anything, so a reader must know their size.
+They are reported beside the observer and are no gate: a cut clip *is* shorter.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ COLUMNS = ("dataset", "cue", "n_pairs", "accuracy", "half_width")
 
 
 def shortcuts(items: pd.DataFrame, videos: pd.DataFrame, root: Path) -> pd.DataFrame:
-    """Return one row a dataset and cue: accuracy of telling side on held-out scenarios, 0.5 is chance.
+    """Return one row per dataset and cue: the accuracy of predicting the side on held-out scenarios; 0.5 is chance.
 
     items are ITEMS rows, videos VIDEOS rows, clips lie under root. Columns: dataset, cue, n_pairs, accuracy, half_width
-    (of a 95 % normal interval over pairs). Every scenario is predicted by a classifier that was fitted on the others
-    (five folds), both its sides in one fold. Datasets of fewer than five scenarios are left out. Raises DamagedClip.
+    (of a 95 % normal interval over pairs). Every scenario is predicted by a classifier fitted on the others (five
+    folds), with both its sides in one fold. Datasets of fewer than five scenarios are left out. Raises DamagedClip.
     """
     clips = videos.drop_duplicates("path").set_index("path")
     cues = _cues(clips, root)
@@ -64,7 +65,7 @@ def _cues(clips: pd.DataFrame, root: Path) -> Mapping[str, tuple[Features, Calla
 
 
 def _hits(items: pd.DataFrame, features: np.ndarray, model: Pipeline) -> np.ndarray:
-    """Return share of its two sides told rightly, for each pair (0, 0.5 or 1)."""
+    """Return the share of correctly predicted sides of each pair (0, 0.5 or 1)."""
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
     void = (items["side"] == "void").to_numpy()

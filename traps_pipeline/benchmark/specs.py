@@ -1,4 +1,4 @@
-"""The scene_specs stage: folded scenarios to fully resolved records with their trajectories."""
+"""The scene_specs stage: resolve corrected scenarios to complete records with their trajectories."""
 
 from __future__ import annotations
 
@@ -24,24 +24,22 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_t
 from traps_pipeline.storage.benchmark_tables import SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
-SECONDS_A_RECORD = 0.04  # of one core, measured: its trajectories are read, and its evidence is measured again
+SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories, and recompute its evidence
 
 
 @dataclass(frozen=True)
-class Resolved:
+class ResolvedScenario:
     """A record and the file of its trajectory."""
 
     spec: SceneSpec
     trajectory: Path
 
 
-def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
-    """Return the record after corrections. Only a changed or added scene is simulated, once; everything else is
-    read.
-    """
+def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenario:
+    """Return the record after corrections. Only a changed or added scene is simulated, once."""
     if scenario.params is None:
         spec = scenario.changed_words()
-        return Resolved(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
+        return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
     spec, trajectory = _resolved_anew(workspace, scenario)
     words = dict(scenario.words)
     if _words_still_fit(scenario):
@@ -53,11 +51,11 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
             f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, "
             f"the simulation {spec.ground_truth!r}; leave the answer out or change the parameters"
         )
-    return Resolved(apply_words(spec, words, scenario.where), trajectory)
+    return ResolvedScenario(apply_words(spec, words, scenario.where), trajectory)
 
 
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
-    """Return the scene that a correction's parameters make, with the family's words for it; simulated once and kept."""
+    """Return the scene of a correction's parameters, with the family's words for it; simulated once and stored."""
     name = _resolved_name(scenario)
     own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(own)
@@ -98,21 +96,23 @@ def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
 
 
 def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
-    """Return the family's words for some parameters, always drawn in the same way for a scenario. Raises ValueError or
-    TypeError where the family has no such parameters."""
+    """Return the family's words for some parameters; the same for the same scenario.
+
+    Raises ValueError or TypeError if the family has no such parameters.
+    """
     family = get_family(family_name)
     rng = np.random.default_rng([seed, *scenario_id.encode()])
     return family.word(family.params_from(params), rng)
 
 
 def _words_still_fit(scenario: Scenario) -> bool:
-    """Return whether the released words fit the corrected parameters: the family has the same words for both."""
+    """Return whether the released words fit the corrected parameters: the family gives both the same words."""
     released = scenario.released
     return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
 
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
-    """Resolve a scene whose parameters a correction gave. Raises TrapsError naming the correction."""
+    """Resolve a scene from a correction's parameters. Raises TrapsError naming the correction."""
     from traps_pipeline.scenes.draw.resolve import resolve
     from traps_pipeline.scenes.parts.wording import draw_ill_posed
     from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -142,13 +142,15 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate how long one core builds a category's table."""
+    """Estimate one core's time to build a category's table."""
     return SECONDS_A_RECORD * sum(one.category == category for one in load_scenarios(workspace.study).values())
 
 
-def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[Resolved]]:
-    """Return rows of scene_specs of a category, and the resolved records behind them. Trajectories are checked by
-    digest."""
+def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
+    """Return a category's rows of scene_specs, and the resolved records behind them.
+
+    Trajectories are compared with their digests.
+    """
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
     released = released_in_study(workspace, category).values()
@@ -163,8 +165,10 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
 
 
 def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
-    """Return the rows of scene_specs that a run would make of a category now. Nothing is simulated or written: a
-    scenario with parameters that were never simulated is left out. Raises TrapsError."""
+    """Return the rows of scene_specs that a run would build for a category now.
+
+    Nothing is simulated or written: a scenario whose parameters were never simulated is left out. Raises TrapsError.
+    """
 
     def is_resolved(scenario: Scenario) -> bool:
         name = f"{_resolved_name(scenario)}.json" if scenario.params is not None else ""
@@ -176,7 +180,7 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
-    """Return released records of a category that the study would have without any correction."""
+    """Return the released records of a category that the study would have without any correction."""
     plain = subset(fold(load_released(), ()), workspace.study)
     return {id_: s.released for id_, s in plain.items() if s.category == category and s.released is not None}
 
@@ -187,13 +191,13 @@ def released_version(workspace: Workspace, category: str) -> str:
 
 
 def corrections_version(workspace: Workspace, category: str) -> str:
-    """Return the version of what the review decisions have made of a category's scenarios in a study."""
+    """Return the version of a category's scenarios after the review decisions, in a study."""
     scenarios = load_scenarios(workspace.study).values()
     return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
 
 
 def void_from_s(spec: SceneSpec) -> float:
-    """Time (s) from which the void shows nothing decisive: hiding (occluder) or the cut (truncation)."""
+    """Return the time (s) from which the void shows nothing decisive: hiding (occluder) or the cut (truncation)."""
     frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]
     return frame / spec.physics["fps"]
 
@@ -201,7 +205,7 @@ def void_from_s(spec: SceneSpec) -> float:
 _AS_JSON = ("params", "physics", "camera", "void", "control", "aliases", "answerable_question", "twin")
 
 
-def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
+def _row(workspace: Workspace, item: ResolvedScenario, version: str) -> SceneSpecRow:
     spec = item.spec
     record = spec.model_dump(mode="json", exclude={"evidence"})
     for name in _AS_JSON:
@@ -220,13 +224,13 @@ def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
 
 
 def _relative(path: Path, *roots: Path) -> str:
-    """Return the path relative to the first root it lies under; as it is under none (a benchmark of one's own)."""
+    """Return the path relative to the first root that contains it; unchanged if none does (a private benchmark)."""
     root = next((root for root in roots if path.is_relative_to(root)), None)
     return (path.relative_to(root) if root else path).as_posix()
 
 
 def spec_of(row: Mapping[str, Any]) -> SceneSpec:
-    """Return a row of scene_specs back to its record."""
+    """Return the record of a row of scene_specs."""
     record = {name: row[name] for name in SceneSpec.model_fields}
     for name in (*_AS_JSON, "evidence"):
         record[name] = json.loads(record[name])
@@ -245,19 +249,19 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
         raise TrapsError(str(error)) from error
 
 
-def unsettled(resolved: Sequence[Resolved]) -> list[str]:
-    """Return problems with outcomes: the certificate `outcome`, measured again from each frozen trajectory."""
+def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
+    """Return problems of outcomes, by recomputing the certificate `outcome` from each frozen trajectory."""
     from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 
     problems = []
     for item in resolved:
         spec = item.spec
         if spec.evidence.get("answer_from") == "correction":
-            continue  # the reviewer's answer stands above the simulator's
+            continue  # the reviewer's answer overrides the simulator's
         qpos = load_trajectory(item.trajectory, spec.trajectory_sha256)
         pair = pair_of(spec, qpos, qpos[:0])
         evidence = OUTCOME.measured(pair)
-        # Nothing is simulated here, so this machine's arithmetic may be another one than the record's.
+        # Nothing is simulated here, so this machine's arithmetic may differ from the record's.
         failure = OUTCOME.failure(evidence, pair.claim) or OUTCOME.contradiction(evidence, spec.evidence, exact=False)
         if failure is not None:
             problems.append(f"{spec.scenario_id}: {failure}")

@@ -1,6 +1,6 @@
-"""The evidence that records carry, judged by the certificates: what the scene_specs stage checks each time.
+"""Check the evidence that records carry against the certificates; the scene_specs stage does so each time.
 
-The evidence was measured when the scenario was resolved; `scenes.certification.certify_record` measures it anew from
+The evidence was measured when the scenario was resolved; `scenes.certification.certify_record` measures it again from
 the trajectories.
 """
 
@@ -18,12 +18,12 @@ _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a traje
 
 
 def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose evidence does not certify the control; one sentence for each certificate that is lost."""
+    """Return records whose evidence does not certify the control; one sentence per lost certificate."""
     return list(_lost(specs, "control"))
 
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose evidence does not certify the void; one sentence for each certificate that is lost."""
+    """Return records whose evidence does not certify the void; one sentence per lost certificate."""
     return list(_lost(specs, "void", "twin", "worlds"))
 
 
@@ -37,7 +37,7 @@ def _lost(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:
 
 
 def answerable_ill_posed(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose ill-posed question nothing refutes, or whose well-posed one something does."""
+    """Return records whose ill-posed question is not refuted, or whose well-posed one is."""
     problems = []
     for spec in specs:
         pair = pair_of(spec, _NO_FRAMES, _NO_FRAMES)

@@ -1,7 +1,7 @@
-"""Benchmark versions: a function of content, so that a study rebuilt from nothing and one corrected in place agree.
+"""Benchmark versions: digests of content, so that a rebuilt study and one corrected in place agree.
 
 A part (a category's specs or clips, a dataset's items) has the release's version while it equals the release, and
-`release+digest` once a correction has touched it. What a correction did not touch keeps its version.
+`release+digest` once a correction has changed it. Other parts keep their version.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
-    """Return `0.2.0`, or `0.2.0+3f2a9c01` when the current content is not the released one."""
+    """Return `0.2.0`, or `0.2.0+3f2a9c01` if the current content differs from the released one."""
     release = load_release().version
     now = sorted(digest(part) for part in current)
     return release if now == sorted(digest(part) for part in released) else f"{release}+{digest(now)[:8]}"
 
 
 def spec_content(spec: SceneSpec) -> str:
-    """Return what the specs' version depends on: everything."""
+    """Return the content behind the specs' version: everything."""
     return spec.spec_hash
 
 
 def clip_content(scenario_id: str, scene_hash: str) -> list[str]:
-    """Return what the clips' version depends on."""
+    """Return the content behind the clips' version."""
     return [scenario_id, scene_hash]
 
 
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return what a dataset's version depends on, of one scenario; `record` is a spec or a row of scene_specs."""
+    """Return a scenario's content behind a dataset's version; `record` is a spec or a row of scene_specs."""
     aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])
     content = [record["scenario_id"], record["scene_hash"], record["question"], list(record["labels"]), aliases]
     content.append(record["ground_truth"])
@@ -42,5 +42,5 @@ def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
 
 
 def spec_record(spec: SceneSpec) -> dict[str, Any]:
-    """Return a spec as `item_content` reads it."""
+    """Return a spec in the form that `item_content` reads."""
     return spec.model_dump(mode="json") | {"scene_hash": spec.scene_hash}

@@ -1,4 +1,4 @@
-"""The videos stage: rows of scene_specs to clips and their table. What is rendered once is never rendered again."""
+"""The videos stage: render rows of scene_specs to clips, each once, and build their table."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
 CLIPS = ("control", "void", "twin")
-SECONDS_A_CLIP = 1.4  # of one core, measured (docs/engineering-notes.md)
+SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render what is missing of a category's clips (three a scenario), beside whoever else does so; what `share`
-    returns. Raises TrapsError."""
+    """Render a category's missing clips (three per scenario), concurrently with other processes.
+
+    Return the result of `share`. Raises TrapsError.
+    """
     specs = _specs(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
@@ -51,7 +53,7 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
 
 def _render(job: Job) -> int:
-    """Render what is missing of a pair and its twin, and keep it for other studies; return the number of frames."""
+    """Render the missing clips of a pair and its twin, and cache them for other studies; return the frame count."""
     frames, rendered = render_pair(job), ClipCache.of_user()
     if rendered is not None:
         rendered.keep(job.clips, job.spec.scene_hash)
@@ -59,7 +61,7 @@ def _render(job: Job) -> int:
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate how long one core renders what is missing of a category, as far as released records tell."""
+    """Estimate one core's time to render a category's missing clips, as far as released records tell."""
     clips = [
         workspace.clip(id_, side, spec.scene_hash)
         for id_, spec in released_in_study(workspace, category).items()
@@ -69,8 +71,10 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
-    """Return rows of the category's clips, which are all there, and the leaked pixels of each occluded void. Raises
-    TrapsError for a clip that is not."""
+    """Return rows of the category's clips, and the leaked pixels of each occluded void.
+
+    Raises TrapsError for a missing clip.
+    """
     specs = _specs(workspace, category)
     try:
         known = known_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
@@ -135,7 +139,7 @@ def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: 
 
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Return clips of the category's table that are gone or have another size: reasons for `traps status`."""
+    """Return clips of the category's table that are lost or have another size, as reasons for `traps status`."""
     table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
     expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
     notes = {path: workspace.relative(note_of(workspace.root / path)) for path in expected}

@@ -1,8 +1,8 @@
-"""The canary: twenty fixed items that a run asks again in each epoch, to see whether a model changed under its name.
+"""The canary: twenty fixed items, asked again in each epoch to detect a changed model behind the same name.
 
-An epoch that is named in `study.yaml` is asked once. Answers are read by rules, whatever panel judges the study: the
-same reader on both sides shows a change of the model, and of nothing else. Answers are sampled, so some change is
-chance; how many changed between two epochs in which nothing happened is the measure for it.
+An epoch that is named in `study.yaml` is asked once. Rules read the answers, whichever panel judges the study: the same
+reader on both sides isolates changes of the model. Answers are sampled, so some changes are chance; the number of
+changes between two quiet epochs measures that.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.reading import read_answer
@@ -32,8 +32,8 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 N_ITEMS = 20
-CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # names the folder of the calls, not a model
-REGIME = "json"  # its final answers are the texts of free models that rules read most often
+CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # a name in the ledger, not a model
+REGIME = "json"  # rules can read its final answers most often
 COMPARED = ("outcome", "abstained", "value")
 
 
@@ -58,7 +58,7 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return the canary's items, of each dataset those with the smallest digests. Raises TrapsError without items."""
+    """Return the canary's items: of each dataset those with the smallest digests. Raises TrapsError without items."""
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
@@ -77,12 +77,12 @@ class _Asked(Call):
 
 
 def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
-    """Return CANARY rows of all epochs, after asking these models what this epoch lacks; the table is written."""
+    """Return CANARY rows of all epochs, after asking these models for this epoch's missing ones; write the table."""
     epoch, items = workspace.study.epoch, canary_items(workspace)
     entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
     calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]
 
-    def finish(settled: Settled[Cell, _Asked]) -> list[CanaryRow]:
+    def finish(settled: SettledCell[Cell, _Asked]) -> list[CanaryRow]:
         return [_row(call, row, epoch) for call, row in settled.answered()]
 
     new = list[CanaryRow]()
@@ -119,10 +119,12 @@ def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
 
 
 def changes(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return what changed from each epoch of a model to its next one, from CANARY rows: model, from, to, served (names
-    then and now), n (items asked in both), outcome, abstained and value (numbers of items that changed in it), tokens
-    (mean change of prompt tokens)."""
-    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # of each model, in the order of asking
+    """Return the changes from each epoch of a model to its next one, from CANARY rows.
+
+    Columns model, from, to, served (names then and now), n (items asked in both), outcome, abstained and value (numbers
+    of changed items), tokens (mean change of prompt tokens).
+    """
+    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # by model, epochs in order
     for row in rows.sort_values(["model", "created_at"], kind="stable").to_dict("records"):
         by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
     changed = list[dict[str, Any]]()
@@ -144,12 +146,12 @@ def _counted(*rows: Mapping[str, Any]) -> bool:
 
 
 def _said(value: Any) -> str:
-    """Return a value of a table for comparison; null equals null, however a file brings it back."""
+    """Return a table's value in comparable form; null equals null in any representation."""
     return "" if pd.isna(value) else str(value)
 
 
 def changes_text(rows: pd.DataFrame) -> str:
-    """Return the changes as a table for a person; a sentence where no model was asked in two epochs."""
+    """Return the changes as a table for people; a sentence if no model was asked in two epochs."""
     table = changes(rows)
     if table.empty:
         return "canary: asked in this epoch; name another epoch in study.yaml to ask again, and what changed is shown"

@@ -1,4 +1,4 @@
-"""`traps doctor`: which steps of a study this machine can do, and what to install for the others."""
+"""Report which steps of a study this machine can run, and what to install for the others (`traps doctor`)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
 FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
-SHOWN = 5  # damaged files of a kind that are named
-UNFINISHED_AFTER_S = 24 * 3600.0  # no file takes so long to write
+SHOWN = 5  # damaged files named per kind
+UNFINISHED_AFTER_S = 24 * 3600.0  # longer than the writing of any file
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
 
 
 def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
-    """Yield one finding for each check of a model; one alone where it cannot be loaded."""
+    """Yield one finding per check of a model; a single one if it cannot be loaded."""
     from traps_pipeline.mechanism.adapter_checks import CHECKS
 
     try:
@@ -100,7 +100,7 @@ def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
 
 
 def examine_files(place: Place) -> Iterator[Finding]:
-    """Yield every file of a study that says what it must hold, read whole: one finding for each kind."""
+    """Read every self-checking file of a study in full; yield one finding per kind."""
     from traps_pipeline.mechanism.hidden_states import damage
     from traps_pipeline.storage.parquet import altered
     from traps_pipeline.storage.workspace import Workspace
@@ -108,7 +108,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
     workspace = Workspace.open(place)
     store, missing = workspace.store, list[str]()
     remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
-    for path in (path for below in remote for path in below):  # fetched, and held against their digests
+    for path in (path for below in remote for path in below):  # fetched, and compared with their digests
         try:
             store.here(path)
         except TrapsError as error:
@@ -133,7 +133,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return the old objects in a study's store that nobody names, and whether they were removed. Raises TrapsError."""
+    """Return the old unreferenced objects in a study's store, and whether they were removed. Raises TrapsError."""
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
@@ -178,7 +178,7 @@ def _damaged_media(note: Path) -> str:
 
 
 def _damaged_history(path: Path) -> str:
-    """Return a damaged history is no loss: it is put aside and begun anew when the next command opens it."""
+    """Return why a history is damaged. The next command puts it aside and begins anew, so nothing is lost."""
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
             (result,) = opened.execute("pragma quick_check(1)").fetchone()
@@ -188,7 +188,7 @@ def _damaged_history(path: Path) -> str:
 
 
 def _remove_unfinished(root: Path) -> str:
-    """Remove files that a killed run began and never finished; nothing reads them. A run may be writing young ones."""
+    """Remove old unfinished files of killed runs; a run may still be writing young ones."""
     old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
     size = sum(path.stat().st_size for path in old)
     for path in old:
@@ -231,12 +231,12 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """Return the keys that are not set, and who needs them. Raises TrapsError for one that no header can carry."""
+    """Return the missing keys with the entries that need them. Raises TrapsError for one that no header can carry."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 
     entries = [*load_models().values(), *load_judges().values()]
     for key in sorted({account.key for account in load_accounts().values() if account.key}):
-        optional_key(key)  # raises where it is set to what is no key
+        optional_key(key)  # raises if its value is no key
     missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
     return "; ".join(missing) or "all set"

@@ -1,7 +1,7 @@
-"""`traps models check --live`, and the preflight of `traps run`: what would go wrong is said before money is spent.
+"""Check models and judges with live calls before money is spent: `traps models check --live`, and preflight.
 
 Each model is asked about a clip that is red and then blue, once with the clip and once without, and in its JSON form;
-each judge votes on answers whose votes are known. What goes wrong is a sentence that names the cause and the remedy.
+each judge votes on answers with known votes. Every problem is a sentence that names the cause and the remedy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.checks.wire_check import Studio, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
-from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import check_money
 from traps_pipeline.models.judges import JudgeEntry, Task
@@ -44,8 +44,8 @@ from traps_pipeline.models.thinking import how_to_declare, split_thinking, undec
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
-CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
-TIMEOUT_S, REACH_S = 25.0, 5.0  # of a call, of what is looked at before: what is wrong is named within half a minute
+CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # a name in the ledger, not a model
+TIMEOUT_S, REACH_S = 25.0, 5.0  # time-outs of a call and of earlier checks
 BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
@@ -62,8 +62,8 @@ _ITEM: Mapping[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Live:
-    """What came of an entry. problems: what keeps its answers from being worth anything; notes: what else was seen."""
+class LiveResult:
+    """The result for an entry. problems: reasons why its answers are worthless; notes: other observations."""
 
     entry: Entry
     problems: Sequence[str]
@@ -71,7 +71,7 @@ class Live:
 
     @property
     def line(self) -> str:
-        """What came of it, in a line for each finding."""
+        """The result as text, with one line per finding."""
         lines = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
         head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
         return redact("\n".join([head, *(f"     {line}" for line in lines)]))
@@ -84,7 +84,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry, by name. They hold the time: an answer of yesterday says nothing of today."""
+    """Return the calls to an entry, by name. They contain the time, so that yesterday's answers are not reused."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -110,46 +110,49 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 
 
 @dataclass(frozen=True)
-class Reached:
-    """What is found before anything is asked. problem: why asking is of no use; unlisted: that the server's own list of
-    models lacks the name; refused: that the list, which wants nothing but a key, is refused. Neither is certain: some
-    servers list what was downloaded, or examples, and a litellm proxy without a database answers 400 to a wrong key."""
+class ServerCheck:
+    """Findings before any call.
+
+    problem: why asking is useless; unlisted: the server's own list of models lacks the name; refused: the list, which
+    needs only a key, is refused. Neither is certain: some servers list what was downloaded, or examples, and a litellm
+    proxy without a database answers 400 to a wrong key.
+    """
 
     problem: str = ""
     unlisted: str = ""
     refused: str = ""
 
 
-def reach(entry: Entry, account: Account) -> Reached:
-    """Look at the key, the address, and the server's own list of models if it has one."""
+def reach(entry: Entry, account: Account) -> ServerCheck:
+    """Check the key, the address, and the server's own list of models if it has one."""
     from traps_pipeline.models.wire import get
 
     try:
         check_network()
         secret = account.secret()
     except TrapsError as error:
-        return Reached(str(error))
+        return ServerCheck(str(error))
     if account.base_url is None:
-        return Reached()
+        return ServerCheck()
     headers = {"Authorization": f"Bearer {secret}"} if secret else {}
     try:
         answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
     except TrapsError as error:
-        return Reached(nobody_at(account.base_url, plain(str(error))))
+        return ServerCheck(nobody_at(account.base_url, plain(str(error))))
     if answer.status_code in (401, 403):
-        return Reached(_wrong_key(account))
+        return ServerCheck(_wrong_key(account))
     if answer.status_code == BAD_REQUEST and account.key:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
-        return Reached(refused=f"{even}: is the one in {account.key} right?")
+        return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
     known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
     if known and model_name(entry) not in known:
         unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
-        return Reached(unlisted=unlisted)
-    return Reached()
+        return ServerCheck(unlisted=unlisted)
+    return ServerCheck()
 
 
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """Return the sentence about an address at which nobody answers."""
+    """Return the sentence about an address without a server."""
     is_here = is_loopback(urlsplit(address).hostname or "")
     remedy = "start the server there" if is_here else "look at this machine's network and proxy variables"
     return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
@@ -170,19 +173,21 @@ def _listed(answer: Any) -> list[Any]:
     return []
 
 
-def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
-    """Return what the outcomes of `requests_of` say of an entry, and what was found before them."""
-    problems, notes, before = list[str](), list[str](), reached or Reached()
+def findings(
+    entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
+) -> LiveResult:
+    """Return the problems and notes from the outcomes of `requests_of`, and from the checks before them."""
+    problems, notes, before = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:
-        return Live(entry, [before.unlisted])
+        return LiveResult(entry, [before.unlisted])
     if before.unlisted:
         notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
     if before.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
-        return Live(entry, [before.refused])
+        return LiveResult(entry, [before.refused])
     for name, outcome in outcomes.items():
         if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
-            continue  # what fails without a schema, too, says nothing of schemas
+            continue  # a failure without a schema, too, says nothing about schemas
         if outcome.kind == "error":
             sentence = _failure(entry, account, name, str(outcome.error))
             if outcome.error == RATE_LIMITED and any(one.kind in WITH_TEXT for one in outcomes.values()):
@@ -203,7 +208,7 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
         problems += [*_wrong_answers(entry, outcomes), *_seen(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
-    return Live(entry, list(dict.fromkeys(problems)), notes)
+    return LiveResult(entry, list(dict.fromkeys(problems)), notes)
 
 
 def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
@@ -235,7 +240,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
 
 
 def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
-    """Return what to declare where an answer shows its thinking between usual marks."""
+    """Return what to declare if an answer shows thinking between common marks."""
     mark = undeclared_mark(split_thinking(outcome.text or "", entry.thinking).answer)
     return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
 
@@ -280,7 +285,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
 
 
 def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
-    """Return whether the clip arrives: its two colours are named, or its tokens are counted."""
+    """Return whether the clip arrives: the answer names its two colours, or its tokens are counted."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
@@ -303,17 +308,17 @@ def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) 
 # --- asking -----------------------------------------------------------------------------------------------------------
 
 
-def check_live(entries: Iterable[Entry]) -> list[Live]:
-    """Ask these entries, side by side, without a study: what it costs is booked nowhere."""
+def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
+    """Ask these entries in parallel, without a study; their cost is not recorded."""
 
-    async def every() -> list[Live]:
+    async def every() -> list[LiveResult]:
         return list(await asyncio.gather(*(one(entry) for entry in entries)))
 
-    async def one(entry: Entry) -> Live:
+    async def one(entry: Entry) -> LiveResult:
         account = account_of(entry)
         reached = await asyncio.to_thread(reach, entry, account)
         if reached.problem:
-            return Live(entry, [reached.problem])
+            return LiveResult(entry, [reached.problem])
         backend = make_backend(entry)
 
         async def asked(request: Request) -> Outcome:
@@ -332,10 +337,11 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
     return asyncio.run(every())
 
 
-def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[Live]:
-    """Look at prices, then ask the models and judges of a run, under its budget; the calls are in the ledger of votes.
+def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[LiveResult]:
+    """Check prices, then ask the models and judges of a run, under its budget.
 
-    Raises TrapsError where the study does not allow what somebody costs: judges are looked at before a model is asked.
+    The calls are in the ledger of votes. Raises TrapsError if the study does not allow a participant's cost: judges are
+    checked before a model is asked.
     """
     entries = [entry for entry in (*models, *judges) if entry.backend == NETWORK]
     for entry in entries:
@@ -354,14 +360,14 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     outcomes: Mapping[str, Outcome] = {}
     if calls:
 
-        def finish(settled: Settled[Cell, Call]) -> Mapping[str, Outcome]:
+        def finish(settled: SettledCell[Cell, Call]) -> Mapping[str, Outcome]:
             return {key: _outcome(row) for key, row in settled.rows.items()}
 
         (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
     problems = []
     for entry in entries:
         if problem := reached[entry.id].problem:
-            problems.append(Live(entry, [problem]))
+            problems.append(LiveResult(entry, [problem]))
         else:
             mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
             problems.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
@@ -373,8 +379,8 @@ def _outcome(row: Row) -> Outcome:
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 
-def require_sound(results: Sequence[Live]) -> None:
-    """Raise TrapsError that names everything that is wrong with anybody."""
+def require_sound(results: Sequence[LiveResult]) -> None:
+    """Raise TrapsError that names every problem of every entry."""
     wrong = [f"{one.entry.id}: {problem}" for one in results for problem in one.problems]
     if wrong:
         more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"

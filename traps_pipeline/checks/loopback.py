@@ -1,4 +1,4 @@
-"""A fake provider on this machine: an entry's backend sends its requests there, and the requests are recorded."""
+"""A fake provider on this machine that records the requests of an entry's backend."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _Loopback(Account):
 
 
 class _Notes(Progress):
-    """Keeps the notes of a backend, such as the reason why a client library refused to send."""
+    """Collects the notes of a backend, such as the reason why a client library refused to send."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """Return the outcome of each request if its provider answered it with this status and JSON."""
+    """Return the outcome of each request as if its provider had answered with this status and JSON."""
     account = load_accounts()[str(entry.account)]
     with _listening(iter(answers)) as (address, _), reporting(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
@@ -87,7 +87,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
                 return error.outcome
 
         async def read_all() -> list[Outcome]:
-            return [await read(request) for request in requests]  # one after the other: answers come in order
+            return [await read(request) for request in requests]  # sequential, since answers come in order
 
         return asyncio.run(read_all())
 

@@ -1,4 +1,4 @@
-"""The request bodies of providers' APIs, parsed into one form, and the fields of each API for each parameter."""
+"""Parse the request bodies of providers' APIs into one form, and list each API's fields for each parameter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENDPOINTS: dict[str, Api] = {
     ":generateContent": "gemini",
     "/v1/messages": "anthropic",
 }
-# A parameter's name in the body, where it differs from the name in the entry.
+# A parameter's name in the body, if it differs from the name in the entry.
 _NAMES: dict[Api, dict[str, str]] = {
     "chat": {},
     "responses": {"max_tokens": "max_output_tokens", "max_completion_tokens": "max_output_tokens"},
@@ -61,9 +61,10 @@ class ClipPart:
 
 @dataclass(frozen=True)
 class ParsedBody:
-    """A body in one form for all APIs. turns: role and parts, each a text, a clip, or None for anything else.
+    """A body in one form for all APIs.
 
-    fields: all other fields, by dotted name; a schema is one field.
+    turns: role and parts, each a text, a clip, or None for anything else. fields: all other fields, by dotted name; a
+    schema is one field.
     """
 
     model: str
@@ -129,7 +130,7 @@ def _camel_name(name: str) -> str:
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return leaves of nested mappings by dotted name."""
+    """Return the leaves of nested mappings by dotted name."""
     if not isinstance(value, dict) or not value or name in SCHEMAS:
         return {name: value}
     leaves: dict[str, Any] = {}
@@ -142,7 +143,7 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
-    """Return exactly the fields that a body of an API must have, by dotted name."""
+    """Return the exact fields of an API's body for these parameters, by dotted name."""
     fields: dict[str, Any] = {}
     for name, value in params.items():
         if name == "response_format":

@@ -1,7 +1,7 @@
-"""`traps models check` compares the request that an entry of the registry sends with the request that it declares.
+"""Compare the request that a registry entry sends with the one that it declares (`traps models check`).
 
-Client libraries rename, add and drop fields without a warning. So each entry is asked one question through the backend
-that studies use, the request is recorded on this machine, and its body must consist of prompt, clip, question, declared
+Client libraries silently rename, add and drop fields. So each entry is asked one question through the backend that
+studies use, the request is recorded on this machine, and its body must consist of prompt, clip, question, declared
 parameters, and nothing else. No key is needed, and nothing leaves the machine.
 """
 
@@ -52,7 +52,7 @@ _PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
 
 
 class Studio:
-    """A clip without a scene, in a folder that exists until this process ends."""
+    """A synthetic clip, in a folder that exists until this process ends."""
 
     def __init__(self, frames: Sequence[np.ndarray], fps: int) -> None:
         self._folder = TemporaryDirectory(prefix="traps-check-")
@@ -61,13 +61,13 @@ class Studio:
         self._media = MediaStore(Path(self._folder.name) / "media")
 
     def prepare(self, spec: MediaSpec) -> Media:
-        """Return the clip as a model is sent it."""
+        """Return the clip as it is sent to a model."""
         return self._media.prepare(self.clip, file_digest(self.clip), spec)
 
 
 @cache
 def _studio() -> Studio:
-    """Film a square that moves over a gradient."""
+    """Render a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
     frames = []
@@ -79,7 +79,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return a request of every form that a study sends: by regime for a model, by task and label for a judge."""
+    """Return one request of every form that a study sends: by regime for a model, by task and label for a judge."""
     if isinstance(entry, ModelEntry):
         media = _studio().prepare(entry.media) if entry.media else None
         return {regime: question(entry, regime, _QUESTION, media, {"regime": regime}) for regime in REGIMES}
@@ -93,7 +93,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 
 
 def question(entry: ModelEntry, regime: str, text: str, sent: Media | None, about: Mapping[str, Any]) -> Request:
-    """Return the request by which a study asks a model a question about a clip."""
+    """Return a study's request that asks a model a question about a clip."""
     return Request(
         participant=entry.id,
         endpoint=entry.endpoint,
@@ -125,7 +125,7 @@ def _short(value: Any) -> str:
 
 
 def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
-    """Yield what is wrong with the turns: prompt and question are verbatim, the clip before the question, no more."""
+    """Yield problems of the turns: prompt and question must be verbatim, the clip before the question, no more."""
     roles = [role for role, _ in turns]
     if roles != ["system", "user"]:
         yield f"the turns are {roles}, not system and user"
@@ -188,7 +188,7 @@ def model_name(entry: Entry) -> str:
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckedEntry:
     """An entry, a line about its request, and the problems of the request."""
 
     entry: Entry
@@ -196,16 +196,16 @@ class Checked:
     problems: list[str]
 
 
-def examine(entry: Entry) -> Checked:
+def examine(entry: Entry) -> CheckedEntry:
     """Send the requests of an entry to this machine and compare them."""
     if entry.backend == NETWORK:
         return _examine_network(entry)
     if isinstance(entry, ModelEntry) and entry.media is not None:
         return _examine_local(entry, entry.media)
-    return Checked(entry, f"{entry.id:<24} nothing is sent anywhere", [])
+    return CheckedEntry(entry, f"{entry.id:<24} nothing is sent anywhere", [])
 
 
-def _examine_network(entry: Entry) -> Checked:
+def _examine_network(entry: Entry) -> CheckedEntry:
     requests = requests_of(entry)
     bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
@@ -217,11 +217,11 @@ def _examine_network(entry: Entry) -> Checked:
     if isinstance(entry, ModelEntry):
         listed += _protocol_problems(entry, requests)
     first = next(iter(requests))
-    return Checked(entry, _line(entry, bodies[first], requests[first].sent), listed)
+    return CheckedEntry(entry, _line(entry, bodies[first], requests[first].sent), listed)
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
-    """Yield departures from the protocol, which holds for every model in addition to its entry."""
+    """Yield departures from the protocol, which applies to every model besides its entry."""
     for regime, request in requests.items():
         if ("response_format" in request.params) != (entry.json_schema and bool(BY_NAME[regime].fields)):
             yield f"{regime}: structured output is for regimes that ask for an object, where the entry has json_schema"
@@ -246,14 +246,14 @@ def _fields(fields: Mapping[str, Any]) -> str:
     return " ".join(f"{name.removeprefix('generationConfig.')}={value}" for name, value in shown.items())
 
 
-def _examine_local(entry: ModelEntry, spec: MediaSpec) -> Checked:
+def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
     """Check the frames that a local model is shown: nothing is sent, but frames are picked and resized."""
     frames = sample(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
     line = f"{entry.id:<24} local  {count} frames of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
     problems = list(_local_problems(frames.times_s, (width, height), spec))
-    return Checked(entry, f"{line}  {_fields(flat(entry.params))}", problems)
+    return CheckedEntry(entry, f"{line}  {_fields(flat(entry.params))}", problems)
 
 
 def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec) -> Iterator[str]:
@@ -272,11 +272,11 @@ def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec)
 
 
 def participants() -> dict[str, Entry]:
-    """Return models and judges that are asked over the network or locally, by id."""
+    """Return the network and local models and judges, by id."""
     return {**load_models(), **load_judges()}
 
 
-def check_named(names: Sequence[str]) -> Iterator[Checked]:
+def check_named(names: Sequence[str]) -> Iterator[CheckedEntry]:
     """Check the entries with these ids, or all that send or show something. Raises TrapsError for an unknown id."""
     known = participants()
     if unknown := [name for name in names if name not in known]:

@@ -1,4 +1,4 @@
-"""The `traps` command: its parser and exit codes. Each other file here has one noun and its commands' arguments."""
+"""The `traps` command: its parser and exit codes. Each other file defines one group of commands and their arguments."""
 
 from __future__ import annotations
 
@@ -60,8 +60,11 @@ A group lists its commands, and `--help` behind a command shows an example.
 
 
 def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | None = None) -> int:
-    """Run a subcommand; return 0 done, 1 failed, 2 bad usage, 4 over budget, 130 interrupted. parser: another's."""
-    gc.set_threshold(50_000, 20, 20)  # imported objects stay: searching them for garbage costs half a second
+    """Run a subcommand and return its exit code.
+
+    0: done, 1: failed, 2: bad usage, 4: over budget, 130: interrupted. parser: replaces the default one.
+    """
+    gc.set_threshold(50_000, 20, 20)  # exclude imported objects from garbage collection, which saves half a second
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
@@ -69,14 +72,14 @@ def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | No
     try:
         return _run(argv, parser or build_parser())
     except BrokenPipeError:
-        # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
+        # The reader has gone (`| head`); the interpreter's last flush must not report that either.
         for stream in (sys.stdout, sys.stderr):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         return INTERRUPTED
 
 
 def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
-    """Run a subcommand. Raises BrokenPipeError where what it prints, or the end of it, is not read."""
+    """Run a subcommand. Raises BrokenPipeError if the reader of its output has gone."""
     try:
         arguments = parser.parse_args(argv)
         command: Run = arguments.command
@@ -108,10 +111,10 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
 
 @contextmanager
 def _stopped_alike() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP do what Ctrl-C does at that moment, until the block ends.
+    """Make SIGTERM and SIGHUP act like Ctrl-C within the block.
 
-    A shell starts `command &` of a script with SIGINT ignored, in which case SIGTERM would do nothing either: both are
-    obeyed again. An ignored SIGHUP stays ignored, which is the meaning of `nohup`.
+    A shell starts `command &` of a script with SIGINT ignored, and then SIGTERM would do nothing either; both are
+    handled again here. An ignored SIGHUP stays ignored, which is the meaning of `nohup`.
     """
     replaced = {}
     for each in STOPS if threading.current_thread() is threading.main_thread() else ():

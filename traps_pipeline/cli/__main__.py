@@ -1,4 +1,4 @@
-"""`python -m traps_pipeline.cli` is `traps`."""
+"""Run `traps` as `python -m traps_pipeline.cli`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""`traps benchmark`: certificates computed again, fresh samples of the benchmark, commitments to them and proofs."""
+"""`traps benchmark`: recompute certificates, sample new benchmarks, commit to them and prove commitments."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import FAILED, OK, Commands, number, print_json, whole
+from traps_pipeline.cli.command import FAILED, OK, Commands, integer, number, print_json
 
 if TYPE_CHECKING:
     from traps_pipeline.release.commitment import Commitment
     from traps_pipeline.scenes.worlds.spec import SceneSpec
 
-# `scenes.parts.look.PARTS`, which takes long to import.
+# Copied from `scenes.parts.look.PARTS`, which takes long to import.
 LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of benchmarks."""
+    """Add the `traps benchmark` commands."""
     text = "compute every certificate of the released records again"
     parser = commands.add("benchmark certify", certify, text, example="--families plinko", workspace=False, json=True)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
-    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
-    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
+    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="certify only these (default: all)")
+    parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
     parser.add_argument(
-        "--fresh", action="store_true", help="certify all again, also scenarios that an earlier call has certified"
+        "--fresh", action="store_true", help="certify all again, also those that an earlier call certified"
     )
 
     text = "sample a fresh benchmark, certified like the released one"
@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         "benchmark sample", sample, text, example="--seed 7 --out private --scale 0.1", workspace=False
     )
     parser.add_argument(
-        "--seed", type=whole(0, 2**63 - 1), required=True, help="the same seed gives the same scenarios"
+        "--seed", type=integer(0, 2**63 - 1), required=True, help="the same seed gives the same scenarios"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the new benchmark")
     parser.add_argument("--name", help="its name (default: private-SEED)")
@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
         "--scale", type=number(0, 1000), default=1.0, help="number of scenarios, relative to the released benchmark"
     )
     parser.add_argument(
-        "--count", type=whole(1, 1_000_000), help="number of scenarios of each family, instead of --scale"
+        "--count", type=integer(1, 1_000_000), help="number of scenarios of each family, instead of --scale"
     )
     parser.add_argument(
         "--look",
@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
         metavar="PART",
         help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: what varies in the released benchmark)",
     )
-    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
+    parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
     example = "private --out public.json --reveal secret.json"
@@ -68,8 +68,8 @@ def add(commands: Commands) -> None:
     parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
     parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
-    parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
-    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
+    parser.add_argument("--without-drawing", action="store_true", help="check --specs alone, without drawing it again")
+    parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
 
 
 def certify(arguments: argparse.Namespace) -> int:
@@ -178,10 +178,15 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
 def _not_drawn(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
-    """Return what the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
-    from traps_pipeline.release.commitment import other_arithmetic, same_scene
+    """Return what the seed does not reproduce here, and whether only this machine's arithmetic explains it."""
+    from traps_pipeline.release.commitment import is_same_scene, other_arithmetic
 
-    if problems and specs is not None and {*specs} == {*drawn} and all(same_scene(specs[i], drawn[i]) for i in specs):
+    if (
+        problems
+        and specs is not None
+        and {*specs} == {*drawn}
+        and all(is_same_scene(specs[i], drawn[i]) for i in specs)
+    ):
         elsewhere = other_arithmetic(published) or "another kind of CPU"
         problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
     return problems

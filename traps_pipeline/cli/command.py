@@ -1,4 +1,4 @@
-"""The parts that all commands share: exit codes, adding a command to the parser, its workspace and experiment.
+"""Shared parts of all commands: exit codes, the parser, the workspace and the experiment of a command.
 
 Only `errors`, `files` and `terminal` of the package are imported here before a command runs, so that `traps --help`
 answers at once.
@@ -32,11 +32,11 @@ METAVAR = "COMMAND"
 # Commands of daily use, which can be given without their group.
 SHORT = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"), "study"), "site": "results"}
 
-Run = Callable[[argparse.Namespace], int]  # a command: it takes its parsed arguments and returns an exit code
+Run = Callable[[argparse.Namespace], int]  # a command takes its parsed arguments and returns an exit code
 
 
-def whole(least: int, most: int) -> Callable[[str], int]:
-    """Return the type of an argument that is a whole number in these bounds, in plain digits."""
+def integer(least: int, most: int) -> Callable[[str], int]:
+    """Return an argparse type for a whole number from `least` to `most`, in plain digits."""
 
     def parse(text: str) -> int:
         if not re.fullmatch(r"-?[0-9]{1,18}", text) or not least <= int(text) <= most:
@@ -47,7 +47,7 @@ def whole(least: int, most: int) -> Callable[[str], int]:
 
 
 def number(above: float, most: float) -> Callable[[str], float]:
-    """Return the type of an argument that is a number in these bounds (the lower one left out), in plain digits."""
+    """Return an argparse type for a number above `above` and at most `most`, in plain digits."""
 
     def parse(text: str) -> float:
         if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,9})?", text) or not above < float(text) <= most:
@@ -57,8 +57,8 @@ def number(above: float, most: float) -> Callable[[str], float]:
     return parse
 
 
-class LineWise(argparse.HelpFormatter):
-    """Help texts whose lines stay lines, each wrapped to the width of the terminal; an example is one to copy."""
+class LineHelpFormatter(argparse.HelpFormatter):
+    """A help formatter that keeps line breaks, and wraps each line to the terminal so that examples can be copied."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         lines = (line if line.startswith("example: ") else textwrap.fill(line, width) for line in text.splitlines())
@@ -66,9 +66,9 @@ class LineWise(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest word, and knows commands of daily use without their group (`short`).
+    """A parser that suggests the nearest word, and accepts commands of daily use without their group (`short`).
 
-    `commands` holds the parser of every command below it by its name, such as `study run`.
+    `commands` maps the name of every command below it, such as `study run`, to its parser.
     """
 
     def __init__(self, *, short: Mapping[str, str] | None = None, **settings: Any) -> None:
@@ -77,13 +77,13 @@ class Parser(argparse.ArgumentParser):
         self._short = short or {}
 
     def options(self) -> list[str]:
-        """Return the options of the command."""
+        """Return the command's option names."""
         return [*dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*", self.format_help()))]
 
     def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
         self, args: Iterable[str] | None = None, namespace: Any = None
     ) -> Any:
-        """See `argparse`. An unknown option is told by the command that it was given to."""
+        """See `argparse`. The command that received an unknown option reports it."""
         words = [*(sys.argv[1:] if args is None else args)]
         if words and words[0] in self._short:
             words.insert(0, self._short[words[0]])
@@ -153,7 +153,7 @@ class Commands:
             help=text,
             description=text,
             epilog=example_line + codes,
-            formatter_class=LineWise,
+            formatter_class=LineHelpFormatter,
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)
@@ -168,7 +168,7 @@ class Commands:
 
 
 def print_failure(text: str) -> None:
-    """Print what went wrong to standard error, a line for each line of it; on a terminal words stay whole."""
+    """Print an error to standard error line by line; on a terminal, wrap between words."""
     for line in f"traps: {text}".splitlines():
         print(wrapped(plain(line), sys.stderr), file=sys.stderr)
 
@@ -179,7 +179,7 @@ def _show_help(arguments: argparse.Namespace) -> int:
 
 
 def print_json(value: Any) -> None:
-    """Print a result as JSON. A figure that is missing is null."""
+    """Print a result as JSON, with null for missing figures."""
     print(json.dumps(_as_json(value), indent=2, ensure_ascii=False, allow_nan=False))
 
 
@@ -202,20 +202,20 @@ def _as_json(value: Any) -> Any:
 
 
 def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) -> None:
-    """Add the arguments of a command whose pages listen; `listening_of` reads them."""
-    parser.add_argument("--port", type=whole(1, 65535), default=port, help=f"of the page (default: {port})")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone)")
-    parser.add_argument("--token", help=f"of the address, instead of a fresh one (default: ${variable})")
-    parser.add_argument(
-        "--behind", default="", help="https address of a proxy that passes requests on (docs/people.md)"
-    )
+    """Add the arguments of a command that serves pages; `listening_of` reads them."""
+    parser.add_argument("--port", type=integer(1, 65535), default=port, help=f"port of the page (default: {port})")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
+    parser.add_argument("--token", help=f"access token, instead of a fresh one (default: ${variable})")
+    parser.add_argument("--behind", default="", help="https address of a reverse proxy in front (docs/people.md)")
 
 
 def listening_of(
     arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
 ) -> Listening:
-    """Return where such a command listens and whom it lets in: who has the token, or each person with a token of their
-    own. danger: what everybody who reaches the address could do. Raises TrapsError."""
+    """Return the address that a command listens at, and the token (one for all, or one per person) that it accepts.
+
+    danger: what everybody who reaches the address could do. Raises TrapsError.
+    """
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
     from traps_pipeline.servers.server import Listening
@@ -229,7 +229,7 @@ def listening_of(
 
 
 def place_of(arguments: argparse.Namespace) -> Place:
-    """Return where a command's study lies, there or not. Raises TrapsError for a wrong address."""
+    """Return the location of a command's study, which need not exist. Raises TrapsError for a wrong address."""
     from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -237,25 +237,25 @@ def place_of(arguments: argparse.Namespace) -> Place:
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:
-    """Return the study that a command works in. Raises TrapsError naming the remedy if there is none."""
+    """Return the study that a command works in. Raises TrapsError with the remedy if there is none."""
     from traps_pipeline.storage.workspace import Workspace
 
-    return entered(Workspace.open(place_of(arguments)))
+    return enter_workspace(Workspace.open(place_of(arguments)))
 
 
-def entered(workspace: Workspace) -> Workspace:
-    """Return the workspace, set in the environment for the partition keys here and in child processes."""
-    from traps_pipeline.models.own import forget
+def enter_workspace(workspace: Workspace) -> Workspace:
+    """Return the workspace after setting it in the environment, for partition keys here and in child processes."""
+    from traps_pipeline.models.user_registry import clear_caches
     from traps_pipeline.storage.workspace import VARIABLE
 
     os.environ[VARIABLE] = str(workspace.place)
-    forget()  # the workspace may have models of its own
+    clear_caches()  # the workspace may define models
     os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
     return workspace
 
 
 def load_definitions() -> None:
-    """Declare the graph, from which staleness is computed, without Dagster."""
+    """Declare the pipeline's graph, from which staleness is computed, without importing Dagster."""
     import traps_pipeline.pipeline.stages  # noqa: F401 - its import is what declares the graph
 
 
@@ -266,12 +266,12 @@ def add_experiment(parser: argparse.ArgumentParser, **settings: Any) -> None:
 
 
 def add_panel(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say who judges."""
-    parser.add_argument("--panel", help="who judges, where the experiment names no panel; kept in study.yaml")
+    """Add the arguments that choose the judges."""
+    parser.add_argument("--panel", help="the judges, if the experiment names no panel; kept in study.yaml")
     parser.add_argument(
         "--judged-by-rules",
         action="store_true",
-        help="let the panel `rules` judge other models than reference models; every table and page then says so",
+        help="let the panel `rules` judge more than reference models; every table and page then says so",
     )
 
 

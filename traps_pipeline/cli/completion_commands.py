@@ -1,4 +1,4 @@
-"""`traps completion`: what a shell needs to complete commands, options, experiments and values."""
+"""`traps completion`: print a shell's completion script for commands, options, experiments and values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCRIPT = """# {use}
   fi
   COMPREPLY=($(compgen -W "$words" -- "$current"))
 }}
-complete -o default -F _traps traps"""  # files where no word fits
+complete -o default -F _traps traps"""  # complete files if no word fits
 USE = {"bash": 'eval "$(traps completion bash)"', "zsh": 'eval "$(traps completion zsh)"'}
 
 

@@ -1,4 +1,4 @@
-"""`traps doctor`: whether this machine meets the requirements of a study."""
+"""`traps doctor`: check whether this machine meets a study's requirements."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ def add(commands: Commands) -> None:
         "--local",
         nargs="*",
         metavar="MODEL",
-        help="check local models instead: devices, NF4, tiny checkpoints of each family, and the models that are named",
+        help="check local models instead: devices, NF4, a tiny checkpoint of each family, and the named models",
     )
     parser.add_argument(
-        "--verify", action="store_true", help="read every table, ledger and clip of the study whole, and name damage"
+        "--verify",
+        action="store_true",
+        help="read every table, ledger and clip of the study in full, and report damage",
     )
     parser.add_argument(
         "--unused",
         nargs="?",
         choices=("show", "remove"),
         const="show",
-        help="what lies in the study's object store and is named by nobody any more: shown (default) or removed",
+        help="show (default) or remove unreferenced objects in the study's object store",
     )
 
 

@@ -1,4 +1,4 @@
-"""`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`: calls that are made elsewhere."""
+"""`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`: make calls elsewhere."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, open_workspace, whole
+from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace
 
 if TYPE_CHECKING:
-    from traps_pipeline.exchange.answer_exchange import Imported
+    from traps_pipeline.exchange.answer_exchange import ImportResult
 
 
 def add(commands: Commands) -> None:
-    """Add the exports and imports."""
+    """Add the export and import commands."""
     text = "write an experiment's missing calls and their media to a folder"
     parser = commands.add("study export-requests", export_calls, text, example="demo --out requests")
     add_experiment(parser)
@@ -26,22 +26,22 @@ def add(commands: Commands) -> None:
         help="with --batch: write media to the folder media/, and refer to it under this address (https, gs, file ...)",
     )  # fmt: skip
 
-    text = "write the votes that are missing as the judges' batch files"
+    text = "write the missing votes as the judges' batch files"
     parser = commands.add("study export-votes", export_votes, text, example="paper --out votes")
     add_experiment(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of batches/")
     text = "import a provider's batch of votes into the ledger"
     parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl")
     add_experiment(parser)
-    parser.add_argument("file", type=Path, help="what came back")
+    parser.add_argument("file", type=Path, help="the returned file")
 
     text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
     parser = commands.add("study import-answers", import_given, text, example="demo answers.jsonl --model oracle")
     add_experiment(parser)
-    parser.add_argument("file", type=Path, help="what came back")
-    parser.add_argument("--model", help="who answered, in a file by item (default: the experiment's only model)")
-    parser.add_argument("--run", type=whole(1, 1_000), default=1, help="of a file by item (default: 1)")
-    parser.add_argument("--key", type=Path, help="of the held-out set whose items a file names")
+    parser.add_argument("file", type=Path, help="the returned file")
+    parser.add_argument("--model", help="the model, for a file by item (default: the experiment's only model)")
+    parser.add_argument("--run", type=integer(1, 1_000), default=1, help="the run, for a file by item (default: 1)")
+    parser.add_argument("--key", type=Path, help="key of the held-out set that the file answers")
     parser.add_argument(
         "--errors", choices=("drop", "keep"), help="texts that look like error messages: leave them out, or import them"
     )
@@ -67,11 +67,11 @@ def export_calls(arguments: argparse.Namespace) -> int:
 def import_given(arguments: argparse.Namespace) -> int:
     """See `traps study import-answers --help`."""
     from traps_pipeline.benchmark.held_out import held_out_key
-    from traps_pipeline.exchange.answer_exchange import Whose, import_answers
+    from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 
     experiment = experiment_of(arguments)
-    whose = Whose(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
-    imported = import_answers(open_workspace(arguments), experiment, arguments.file, whose, arguments.errors)
+    context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
+    imported = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
     return _imported(imported, arguments, "answers")
 
 
@@ -99,7 +99,7 @@ def _exported(files: Sequence[Path], count: int, command: str) -> int:
     return OK
 
 
-def _imported(imported: Imported, arguments: argparse.Namespace, what: str) -> int:
+def _imported(imported: ImportResult, arguments: argparse.Namespace, what: str) -> int:
     print(f"{imported.new} {what} imported, {imported.known} were there already")
     if imported.dropped:
         print(f"{imported.dropped} error messages were left out; what they stand for is still missing")

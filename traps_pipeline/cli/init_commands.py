@@ -1,4 +1,4 @@
-"""`traps init`: the workspace of an experiment."""
+"""`traps init`: create the workspace of an experiment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, add_experiment, add_panel, entered, experiment_of, place_of
+from traps_pipeline.cli.command import OK, Commands, add_experiment, add_panel, enter_workspace, experiment_of, place_of
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
@@ -36,17 +36,17 @@ def init(arguments: argparse.Namespace) -> int:
 
 
 def create(arguments: argparse.Namespace, experiment: Experiment, database: str | None = None) -> Workspace:
-    """Return the workspace that a command names, with the experiment in its study; a missing workspace is made.
+    """Return the workspace that a command names, with the experiment in its study; create it if it is missing.
 
-    database: the variable with the address of the study's database, where one is asked for. Raises TrapsError if the
-    existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
+    database: the environment variable with the address of the study's database, if one is requested. Raises TrapsError
+    if the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.benchmark.corrections import load_scenarios
-    from traps_pipeline.models.own import keep
+    from traps_pipeline.models.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
     place, by_rules = place_of(arguments), arguments.judged_by_rules
-    if not Workspace.is_there(place):  # refused before a folder is made
+    if not Workspace.is_there(place):  # refuse before a folder is created
         experiment.judged(None, arguments.panel, judged_by_rules=by_rules)
         load_scenarios(experiment.study)
     workspace = Workspace.create(place, experiment.study.model_copy(update={"database": database}))
@@ -66,11 +66,11 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     experiments = workspace.study.experiments | {experiment.name: experiment.asked}
     if experiments != workspace.study.experiments:
         workspace = workspace.allow(experiments=experiments)
-    entered(workspace)
-    keep(workspace)
+    enter_workspace(workspace)
+    save_entries(workspace)
     if not (workspace.dagster_home / "dagster.yaml").exists():
         from traps_pipeline.pipeline.run import dagster_history
 
-        with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
+        with dagster_history(workspace):  # open it once here, so that several processes can use it afterwards
             pass
     return workspace

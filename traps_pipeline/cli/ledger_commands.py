@@ -1,4 +1,4 @@
-"""`traps study export-ledger`, `import-ledger`, `move`, `release-money`: answers, votes and money of a study."""
+"""`traps study export-ledger`, `import-ledger`, `move`, `release-money`: a study's answers, votes and money."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of the ledger."""
+    """Add the ledger commands."""
     text = "write answers, votes and money to one file, as they are"
     parser = commands.add("study export-ledger", export, text, example="ledger.sqlite")
-    parser.add_argument("file", type=Path, metavar="FILE", help="to be made")
+    parser.add_argument("file", type=Path, metavar="FILE", help="the file to write")
     text = "read an exported ledger into a study without answers: in its folder, or in the database of study.yaml"
     parser = commands.add("study import-ledger", import_, text, example="ledger.sqlite")
-    parser.add_argument("file", type=Path, metavar="FILE", help="of `traps study export-ledger`")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a file of `traps study export-ledger`")
     text = "move the whole study into an object store that several hosts share"
     parser = commands.add("study move", move, text, example="--store s3://bucket/study")
     parser.add_argument("--store", metavar="ADDRESS", required=True, help="s3://BUCKET/STUDY")
 
-    text = "give back money that is booked for calls that never left; without arguments: list what may be released"
+    text = "release money reserved for calls that were never sent; without arguments: list what may be released"
     example = "--participant qwen --usd 1.50 --why killed"
     parser = commands.add("study release-money", release, text, example=example, json=True)
-    parser.add_argument("--participant", metavar="NAME", help="the model or judge whose money it is")
+    parser.add_argument("--participant", metavar="NAME", help="the model or judge that holds the reservation")
     amount = parser.add_mutually_exclusive_group()
-    amount.add_argument("--usd", type=float, metavar="X", help="so many dollars")
+    amount.add_argument("--usd", type=float, metavar="X", help="amount in dollars")
     amount.add_argument("--all-in-flight", action="store_true", help="all of its calls in flight when a process died")
     parser.add_argument("--why", help="the reason, which is recorded with your name and the time")
 

@@ -1,15 +1,15 @@
-"""`traps models`: whether entries send what they declare and answer; whether an answer can instruct a panel."""
+"""`traps models`: check that entries send what they declare and answer, and that no answer can instruct a panel."""
 
 from __future__ import annotations
 
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import FAILED, OK, Commands, entered, open_workspace, place_of, print_json
+from traps_pipeline.cli.command import FAILED, OK, Commands, enter_workspace, open_workspace, place_of, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of models."""
+    """Add the `traps models` commands."""
     text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
     parser = commands.add("models check", check, text, example="mine.yaml --live", json=True)
     parser.add_argument(
@@ -49,9 +49,9 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _named(arguments: argparse.Namespace) -> list[str]:
-    """Return the ids of models and judges that are named, those of panels and experiments among them.
+    """Return the ids of the named models and judges, with those of named panels and experiments.
 
-    An own entry of the workspace is known, too. Raises TrapsError for a panel that cannot vote, named or not.
+    The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
     """
     from traps_pipeline.models.judges import load_panel, load_panels
     from traps_pipeline.pipeline.experiment import load_experiment
@@ -59,7 +59,7 @@ def _named(arguments: argparse.Namespace) -> list[str]:
 
     place = place_of(arguments)
     if Workspace.is_there(place):
-        entered(Workspace.open(place))
+        enter_workspace(Workspace.open(place))
     names, panels = list[str](), {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
     for name in arguments.names:
         if name in panels:

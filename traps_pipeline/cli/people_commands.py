@@ -1,4 +1,4 @@
-"""`traps people`: pages on which people review scenarios, and label clips and answers; the judge held against them."""
+"""`traps people`: serve review and labelling pages, and validate the judge against people's labels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REVIEW_TOKEN, ANNOTATE_TOKEN = "TRAPS_REVIEW_TOKEN", "TRAPS_ANNOTATE_TOKEN"
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of people."""
+    """Add the `traps people` commands."""
     text = "serve a page to review scenarios on: keep, correct, discard; print its address"
     parser = commands.add("people review", review, text, example="--who jd")
     parser.add_argument("--who", default=os.environ.get("USER", ""), help="whose decisions these are (default: $USER)")
@@ -55,7 +55,7 @@ def review(arguments: argparse.Namespace) -> int:
     require_own_corrections()
     workspace = open_workspace(arguments)
     opened = Review(workspace, arguments.who.strip())
-    _ = opened.specs  # a study without scenes is told before the address is
+    _ = opened.specs  # report a study without scenes before printing the address
     serve(review_app(opened), listening)
     return OK
 

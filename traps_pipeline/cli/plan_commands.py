@@ -1,4 +1,4 @@
-"""`traps plan`: the calls that an experiment would make, and their cost."""
+"""`traps plan`: print the calls that an experiment would make, and their cost."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ def add(commands: Commands) -> None:
     text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
     parser = commands.add("study plan", plan, text, example="demo", json=True)
     add_experiment(parser)
-    parser.add_argument("--card", default="H100", help="GPU whose hours are given: H100 (default), A100, L40S, RTX4090")
+    parser.add_argument(
+        "--card", default="H100", help="GPU for which hours are estimated: H100 (default), A100, L40S, RTX4090"
+    )
     add_panel(parser)
 
 
@@ -132,7 +134,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:
-    """Print passes, tokens, hours of a card and memory of local models; the sum leaves out models without a size."""
+    """Print passes, tokens, GPU-hours and memory of local models; the sum leaves out models without a size."""
     rows = [
         (
             cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",

@@ -1,4 +1,4 @@
-"""Progress of a run on standard error: a live region on a terminal, elsewhere lines of text or of JSON."""
+"""Print a run's progress to standard error: a live region on a terminal, otherwise lines of text or JSON."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OF_CALLS = 58  # columns of the live table beside the name
 
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
-    """Return the progress that a command installs. form: `auto` is a live region where the stream is a terminal."""
+    """Return the progress that a command installs. form: `auto` chooses a live region if the stream is a terminal."""
     out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
     is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
     kind = LiveProgress if form == "auto" and is_terminal else PrintedProgress
@@ -35,19 +35,19 @@ def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedP
 
 
 class PrintedProgress(Progress):
-    """A line for each stage that has asked, rendered or lasted, one for all others together, one every 30 s."""
+    """Print one line for each stage that called, rendered or took long, one for all others, and one every 30 s."""
 
     beat_s = HEARTBEAT_S
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
         self._stream, self._is_gone = stream, False
-        self._printing = threading.RLock()  # a signal's note may come while its own thread prints
+        self._printing = threading.RLock()  # a signal handler may add a note while its own thread prints
         self._tables, self._tables_s = 0, 0.0
         self._closed = threading.Event()
 
     def start(self) -> None:
-        """Begin to print the state of the stage that runs."""
+        """Start printing the state of the running stage."""
         threading.Thread(target=self._beat, daemon=True).start()
 
     def end_stage(self) -> None:
@@ -75,16 +75,16 @@ class PrintedProgress(Progress):
         self.write(f"! {plain(text)}")
 
     def tell(self, text: str) -> None:
-        """Print a result that a person waits for."""
+        """Print a result that the user waits for."""
         self.write(text)
 
     def beat(self) -> None:
-        """Print the state of the stage that runs; called every 30 s."""
+        """Print the state of the running stage; called every 30 s."""
         if self.current_stage is not None:
             self.write(self.line())
 
     def write(self, text: str) -> None:
-        """Print text, which may hold a provider's words. A stream that is gone ends the run as SIGTERM would."""
+        """Print text, which may hold a provider's words. A closed stream ends the run as SIGTERM would."""
         try:
             with self._printing:
                 for each in text.split("\n"):
@@ -107,7 +107,7 @@ class PrintedProgress(Progress):
 
 
 class JsonProgress(PrintedProgress):
-    """The same as lines of JSON: `begin` and `end` of each stage, `progress` every 30 s, `note`."""
+    """Print progress as lines of JSON: `begin` and `end` of each stage, `progress` every 30 s, `note`."""
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
@@ -137,7 +137,7 @@ class JsonProgress(PrintedProgress):
 
 
 class LiveProgress(PrintedProgress):
-    """A region at the bottom of the terminal for the whole run; lines of ended stages and notes scroll above it."""
+    """Show a region at the bottom of the terminal; lines of finished stages and notes scroll above it."""
 
     beat_s = 0.3
 

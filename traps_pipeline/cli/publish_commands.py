@@ -1,4 +1,4 @@
-"""`traps publish`: releases, their checksums and harnesses; a study as one file and in others' forms; boards."""
+"""`traps publish`: write and verify releases and submissions, harness folders, results files and leaderboards."""
 
 from __future__ import annotations
 
@@ -8,65 +8,69 @@ from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace, print_json, whole
+from traps_pipeline.cli.command import FAILED, OK, Commands, integer, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of what is published."""
+    """Add the `traps publish` commands."""
     text = "write the folder that is published: clips, questions, labels, certificates, card, checksums"
     parser = commands.add("publish release", release, text, example="out --anonymous")
-    parser.add_argument("folder", type=Path, help="an empty or new one")
-    parser.add_argument("--arms", nargs="+", default=[], metavar="ARM", help="also the items and clips of these arms")
+    parser.add_argument("folder", type=Path, help="an empty or new folder")
+    parser.add_argument(
+        "--arms", nargs="+", default=[], metavar="ARM", help="also publish the items and clips of these arms"
+    )
     parser.add_argument("--anonymous", action="store_true", help="name no author, for double-blind review")
     parser.add_argument(
         "--without-answers", type=Path, metavar="KEY",
-        help="a held-out set: items under opaque names, which only this file tells (it is made where it is missing)",
+        help="publish a held-out set, whose items have opaque names; this file maps them (created if missing)",
     )  # fmt: skip
     parser.add_argument(
         "--commitment", type=Path, metavar="FILE", help="publish a file of `traps benchmark commit` with it"
     )
-    parser.add_argument("--date", metavar="YYYY-MM-DD", help="of the publication, for the descriptions")
+    parser.add_argument("--date", metavar="YYYY-MM-DD", help="date of publication, for the descriptions")
     parser.add_argument("--sign", type=Path, metavar="PEM", help="sign it with this private elliptic key")
 
-    text = "name what was altered in a release, or what does not hold in a submission"
+    text = "report what was altered in a release, or what is wrong in a submission"
     parser = commands.add("publish verify", verify, text, example="out", workspace=False, json=True)
     parser.add_argument(
         "path", type=Path, help="a folder of `traps publish release`, or a file of `traps publish submit`"
     )
-    parser.add_argument("--key", type=Path, metavar="PEM", help="of a release: check its signature, too")
-    parser.add_argument("--release", type=Path, metavar="FOLDER", help="of a submission: hold its items against this")
+    parser.add_argument("--key", type=Path, metavar="PEM", help="public key: check a release's signature too")
+    parser.add_argument(
+        "--release", type=Path, metavar="FOLDER", help="check a submission's items against this release"
+    )
 
-    text = "write the folder with which inspect_ai and lmms-eval evaluate models on a release"
+    text = "write the folder that lets inspect_ai and lmms-eval evaluate models on a release"
     parser = commands.add("publish harness", harness, text, example="out harness", workspace=False)
     parser.add_argument("release", type=Path, help="a folder that `traps publish release` wrote")
-    parser.add_argument("folder", type=Path, help="an empty or new one")
+    parser.add_argument("folder", type=Path, help="an empty or new folder")
     parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
     parser.add_argument(
-        "--uniform", type=whole(1, 1000), metavar="N",
-        help="so many evenly spaced frames of a clip, for a model whose entry says so (default: 25, at 5 a second)",
+        "--uniform", type=integer(1, 1000), metavar="N",
+        help="show N evenly spaced frames of a clip, if the model's entry says so (default: 25, at 5 a second)",
     )  # fmt: skip
 
     text = "pack a study's items, answers, votes and numbers into one file"
     parser = commands.add("publish submit", submit, text, example="mine.zip --name mine")
     parser.add_argument("file", type=Path, help="the zip to write")
-    parser.add_argument("--name", required=True, help="of the submission: lower-case letters, digits, - and .")
+    parser.add_argument("--name", required=True, help="name of the submission: lower-case letters, digits, - and .")
 
     text = "write the leaderboard as the hub's .eval_results, as Every Eval Ever JSON, and as Parquet"
     parser = commands.add("publish results", results, text, example="results --dataset owner/name")
     parser.add_argument("folder", type=Path, help="where the files are written")
     parser.add_argument("--dataset", required=True, metavar="OWNER/NAME", help="repository of the release on the hub")
-    parser.add_argument("--organization", default="unknown", help="who made the evaluation")
-    parser.add_argument("--developer", default="unknown", help="of the models, as the hub names it")
+    parser.add_argument("--organization", default="unknown", help="the evaluating organization")
+    parser.add_argument("--developer", default="unknown", help="developer of the models, as the hub names it")
 
-    text = "verify submissions, and make one page of them; other versions or panels are not ranked together"
+    text = "verify submissions, and write one page of them; versions and panels are ranked apart"
     parser = commands.add(
         "publish leaderboard", leaderboard, text, example="mine.zip --out board", workspace=False, json=True
     )
     parser.add_argument(
         "submissions", type=Path, nargs="+", help="files of `traps publish submit`, or folders of such files"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="of the page and its table")
-    parser.add_argument("--release", type=Path, metavar="FOLDER", help="hold items and clips against this release")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="folder for the page and its table")
+    parser.add_argument("--release", type=Path, metavar="FOLDER", help="check items and clips against this release")
 
 
 def release(arguments: argparse.Namespace) -> int:
@@ -77,7 +81,7 @@ def release(arguments: argparse.Namespace) -> int:
     from traps_pipeline.release.signing import sign
 
     if arguments.sign:
-        require("sign")  # before anything is written
+        require("sign")  # check it before anything is written
     workspace, target = open_workspace(arguments), arguments.folder.absolute()
     options = Options(
         arms=arguments.arms,
@@ -98,7 +102,7 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def _date(text: str | None) -> str | None:
-    """Return a date as it was given. Raises TrapsError if it is none."""
+    """Return a date unchanged. Raises TrapsError if it is invalid."""
     from datetime import date
 
     try:
@@ -134,7 +138,7 @@ def verify(arguments: argparse.Namespace) -> int:
 
 
 def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
-    """Return what `traps publish verify` says of a submission."""
+    """Return the report of `traps publish verify` on a submission."""
     from traps_pipeline.release.submission import read_submission
     from traps_pipeline.release.verification import verify
 
@@ -153,10 +157,10 @@ def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
 
 def harness(arguments: argparse.Namespace) -> int:
     """See `traps publish harness --help`."""
-    from traps_pipeline.release.harness.write import LMMS, shown, write_harness
+    from traps_pipeline.release.harness.write import LMMS, media_settings, write_harness
 
     target = arguments.folder.absolute()
-    count = write_harness(arguments.release, target, shown(arguments.media, arguments.uniform))
+    count = write_harness(arguments.release, target, media_settings(arguments.media, arguments.uniform))
     print(f"{count} items in {target}")
     print(f"next: inspect eval {target / 'traps_task.py'} -T regime=standard --model MODEL")
     print(f"or: python -m lmms_eval --include_path {target / LMMS} --tasks traps_standard --model MODEL --log_samples")
@@ -177,9 +181,9 @@ def submit(arguments: argparse.Namespace) -> int:
 
 def results(arguments: argparse.Namespace) -> int:
     """See `traps publish results --help`."""
-    from traps_pipeline.release.results import Who, write_results
+    from traps_pipeline.release.results import Attribution, write_results
 
-    target, who = arguments.folder.absolute(), Who(arguments.organization, arguments.developer)
+    target, who = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
     files = write_results(open_workspace(arguments), target, arguments.dataset, who)
     print(f"{len(files)} files in {target}")
     return OK

@@ -1,4 +1,4 @@
-"""`traps results`: write the explorer and all results, check the published tables, compare studies."""
+"""`traps results`: write the explorer and all results, audit the published tables, compare studies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, p
 
 
 def add(commands: Commands) -> None:
-    """Add the commands of results."""
+    """Add the `traps results` commands, and `traps site`."""
     text = "write a folder to explore all answers and clips in; it opens from disk"
     parser = commands.add("results site", site, text, example="site --without-clips")
     parser.add_argument("folder", nargs="?", type=Path, help="default: `site` in the study's folder")
@@ -20,7 +20,7 @@ def add(commands: Commands) -> None:
 
     text = "recompute published values from other published tables, and compare"
     parser = commands.add("results audit", audit_published, text, example="--all", workspace=False, json=True)
-    parser.add_argument("--all", action="store_true", help="show also the statements that agree")
+    parser.add_argument("--all", action="store_true", help="also show the statements that agree")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
     text = "write every table, figure and page to a folder"
@@ -105,7 +105,7 @@ def compare_studies(arguments: argparse.Namespace) -> int:
 
 
 def _cell(value: object) -> str:
-    """Return a figure with four digits, a dash for one that is missing."""
+    """Return a figure with four digits, or a dash if it is missing."""
     if not isinstance(value, float):
         return str(value)
     return "-" if value != value else f"{value:.4f}"

@@ -1,4 +1,4 @@
-"""`traps run`: make every missing or stale partition of an experiment."""
+"""`traps run`: materialize every missing or stale partition of an experiment."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from traps_pipeline.cli.command import (
     add_experiment,
     add_panel,
     experiment_of,
+    integer,
     load_definitions,
     number,
     print_failure,
     print_json,
-    whole,
 )
 from traps_pipeline.cli.init_commands import create
 
@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
     add_panel(parser)
     parser.add_argument(
         "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
-        help="most dollars for calls over the network, in this study or to one model or judge; kept in study.yaml",
+        help="maximum dollars for calls over the network, in this study or to one model or judge; kept in study.yaml",
     )  # fmt: skip
     parser.add_argument(
         "--allow-unknown-prices",
@@ -67,9 +67,7 @@ def add(commands: Commands) -> None:
         default="auto",
         help="on standard error: a live region on a terminal and lines elsewhere (auto), lines, or lines of JSON",
     )
-    parser.add_argument(
-        "--cluster", action="store_true", help="make it on the hosts of a Ray cluster (docs/cluster.md)"
-    )
+    parser.add_argument("--cluster", action="store_true", help="run on the hosts of a Ray cluster (docs/cluster.md)")
     parser.add_argument(
         "--on-interrupt",
         choices=("leave", "cancel"),
@@ -78,18 +76,18 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--runs",
-        type=whole(1, 500),
+        type=integer(1, 500),
         default=40,
-        help="runs that --cluster cuts each group of stages into (default: 40)",
+        help="number of runs per group of stages with --cluster (default: 40)",
     )
     parser.add_argument(
-        "--gpus", type=number(0, 1000), default=0.0, help="GPUs of a run of --cluster that loads a local model"
+        "--gpus", type=number(0, 1000), default=0.0, help="with --cluster: GPUs per run that loads a local model"
     )
     parser.add_argument(
         "--cpus",
-        type=whole(1, 1000),
+        type=integer(1, 1000),
         default=1,
-        help="cores of a run of --cluster that renders clips or fits probes, which works on all of them (default: 1)",
+        help="with --cluster: cores per run that renders clips or fits probes (default: 1)",
     )
 
 
@@ -113,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
             experiment,
             until=arguments.until,
             preflight=None if arguments.no_preflight else progress.tell,
-            look_at_machine=not arguments.cluster,  # there the hosts that make runs look at themselves
+            look_at_machine=not arguments.cluster,  # on a cluster, each host checks itself
             open_runs=partial(_open_runs, arguments),
         )
     if not arguments.json:
@@ -159,7 +157,7 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
 
 
 def _print_problems(problems: Sequence[str]) -> None:
-    """Print each cause once, and last the one of most problems: it is what to mend."""
+    """Print each cause once, the one behind most problems last: it is the one to fix first."""
     alike = dict[str, list[str]]()
     for problem in problems:
         alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
@@ -174,7 +172,7 @@ def _print_problems(problems: Sequence[str]) -> None:
 
 @contextmanager
 def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
-    """Open what makes the runs: this process, or the hosts of a cluster. Raises TrapsError where there is none."""
+    """Open the executor of runs: this process, or a cluster's hosts. Raises TrapsError if there is none."""
     from traps_pipeline.definitions import defs
     from traps_pipeline.pipeline.runs import RunsHere
 
@@ -187,7 +185,10 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """Return the workspace with the budgets of the command, else the experiment. Raises TrapsError for a wrong one."""
+    """Return the workspace with the budgets of the command, otherwise of the experiment.
+
+    Raises TrapsError for a wrong one.
+    """
     fields = {name: getattr(experiment, name) for name in MONEY}
     money: dict[str, Any] = {name: value for name, value in fields.items() if value is not None}
     if arguments.allow_unknown_prices:

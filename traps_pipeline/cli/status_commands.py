@@ -1,4 +1,4 @@
-"""`traps status` and `traps why`: the state of a study and of an item's answers."""
+"""`traps status` and `traps why`: show the state of a study and of an item's answers."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from traps_pipeline.cli.command import (
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
 
-MOST_KEYS, MOST_REASON = 4, 300  # partitions and characters that are printed for a reason
+MOST_KEYS, MOST_REASON = 4, 300  # partitions and characters printed per reason
 
 
 def add(commands: Commands) -> None:
     """Add `traps status` and `traps why`."""
     text = "say what is not fresh, why, and which command makes it again"
     parser = commands.add("study status", status, text, example="demo", json=True)
-    add_experiment(parser, nargs="?", help="only what this one wants (default: the whole study)")
+    add_experiment(parser, nargs="?", help="show only this experiment's part (default: the whole study)")
     text = "show an item, its answers and votes, and say which answers are valid and which will be asked again"
     parser = commands.add("study why", why, text, example="occlusion:domino_chain-0001:void", json=True)
     parser.add_argument("item", help="dataset:scenario:side")
@@ -79,7 +79,7 @@ def status(arguments: argparse.Namespace) -> int:
 
 
 def _command(workspace: Workspace, experiment: str | None) -> str:
-    """Return the command that makes what is not fresh: of the experiment that was given, or of the study's only one."""
+    """Return the command that refreshes stale partitions, for the given experiment or the study's only one."""
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
     given = [experiment] if experiment else [*workspace.study.experiments]

@@ -1,4 +1,4 @@
-"""`traps ui`: Dagster's web server and daemon for a study, for the person who started it alone."""
+"""`traps ui`: serve Dagster's pages of a study, for the person who started it only."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import os
 import sys
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, number, open_workspace, whole
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, integer, number, open_workspace
 
 CLUSTER = "of a study on a cluster"
-_OWN_S = 5.0  # the second process's own, after all that it started has ended
+_OWN_S = 5.0  # time for the second process itself, after its children have ended
 
 
 def add(commands: Commands) -> None:
     """Add `traps ui`."""
     text = "start Dagster's web server and daemon; print the address to open, with its token"
     parser = commands.add("study ui", ui, text, example="--port 3001")
-    parser.add_argument("--port", type=whole(1, 65535), default=3000, help="of the web server (default: 3000)")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone)")
+    parser.add_argument("--port", type=integer(1, 65535), default=3000, help="port of the web server (default: 3000)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
     parser.add_argument(
-        "--cpus", type=whole(1, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
+        "--cpus", type=integer(1, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
     )
     parser.add_argument(
         "--gpus", type=number(0, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
     )
-    parser.add_argument("--token", help="of the address, instead of a fresh one (default: $TRAPS_UI_TOKEN)")
+    parser.add_argument("--token", help="access token, instead of a fresh one (default: $TRAPS_UI_TOKEN)")
 
 
 def ui(arguments: argparse.Namespace) -> int:
@@ -46,11 +46,11 @@ def ui(arguments: argparse.Namespace) -> int:
 
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
         if value is not None:
-            os.environ[variable] = str(value)  # for the daemon, which starts such runs
+            os.environ[variable] = str(value)  # read by the daemon, which starts such runs
     try:
         workspace = open_workspace(arguments)
         with dagster_history(workspace):
-            pass  # made once by one process, before several open it
+            pass  # one process creates it before several open it
         serve_with_dagster(arguments.host, arguments.port, token)
     except KeyboardInterrupt:
-        return INTERRUPTED  # the first process says it
+        return INTERRUPTED  # the first process reports it

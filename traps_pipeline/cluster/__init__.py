@@ -1,1 +1,1 @@
-"""Everything that only several hosts need: runs on Ray, a study in an object store, shared history and logs."""
+"""Support for several hosts: runs on Ray, a study in an object store, shared history and logs."""

@@ -1,4 +1,4 @@
-"""A place in an object store (S3, Google, Azure), through obstore, and what is said where it cannot be used."""
+"""A place in an object store (S3, Google, Azure), through obstore, with errors as sentences."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.keys import optional_key
 
-# What a host exports for a store of each kind: names that obstore reads.
+# Environment variables that obstore reads, by kind of store.
 KEYS = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, and AWS_ENDPOINT for a server of your own",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS, the path of a file with a service account's key",
@@ -22,16 +22,16 @@ _SECRETS = {
     "gs": (),
     "az": ("AZURE_STORAGE_ACCOUNT_KEY",),
 }
-_NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # what the services call it; Azure the latter
+_NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # the services' terms; Azure's is the latter
 
 
 def object_name(digest: bytes) -> str:
-    """Return where the content with that SHA-256 lies, in the store and in a scratch folder."""
+    """Return the name of the content with that SHA-256, in the store and in a scratch folder."""
     return f"{digest.hex()[:2]}/{digest.hex()}"
 
 
 class Bucket:
-    """A place in an object store. address: as TRAPS_WORKSPACE has it, for example s3://bucket/study."""
+    """A place in an object store. address: as in TRAPS_WORKSPACE, for example s3://bucket/study."""
 
     def __init__(self, address: str) -> None:
         require("cluster", "obstore")
@@ -48,8 +48,10 @@ class Bucket:
 
     @contextmanager
     def _used(self) -> Iterator[None]:
-        """Use the store within the block. Raises FileNotFoundError where an object is not there, TrapsError where
-        the store cannot be used."""
+        """Translate errors within the block.
+
+        Raises FileNotFoundError for a missing object, TrapsError if the store cannot be used.
+        """
         from obstore.exceptions import BaseError, NotFoundError
 
         try:
@@ -62,7 +64,7 @@ class Bucket:
             raise self.error(error) from None
 
     def get(self, name: str) -> bytes | None:
-        """Return the content of an object; None where there is none. Raises TrapsError."""
+        """Return the content of an object; None if it is missing. Raises TrapsError."""
         import obstore
 
         with suppress(FileNotFoundError), self._used():
@@ -70,7 +72,7 @@ class Bucket:
         return None
 
     def size(self, name: str) -> int | None:
-        """Return the size of an object in bytes; None where there is none. Raises TrapsError."""
+        """Return the size of an object in bytes; None if it is missing. Raises TrapsError."""
         import obstore
 
         with suppress(FileNotFoundError), self._used():
@@ -92,7 +94,7 @@ class Bucket:
             obstore.delete(self._store, names)
 
     def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
-        """Yield name, size in bytes and time of writing of all objects (below a name). Raises TrapsError."""
+        """Yield name, size in bytes and modification time of all objects (below a name). Raises TrapsError."""
         import obstore
 
         with self._used():
@@ -100,7 +102,7 @@ class Bucket:
                 yield from ((one["path"], one["size"], one["last_modified"]) for one in page)
 
     def error(self, error: Exception) -> TrapsError:
-        """Return what a person reads of a store that cannot be used."""
+        """Return the sentence for people about a store that cannot be used."""
         reason = " ".join(str(error).split())[:300]
         return TrapsError(
             f"{self.address}: cannot be used from the host {socket.gethostname()} ({reason}). See that the bucket "

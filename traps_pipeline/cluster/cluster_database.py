@@ -1,4 +1,4 @@
-"""The database in which hosts share names of files and leases: the one that holds the study's ledger."""
+"""Leases in the database that holds the study's ledger."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ database_of = postgres_of
 
 
 def lease(database: Database, name: str) -> Lease | None:
-    """Take a piece of work of the study, as `Store.lease` says: an advisory lock, which this process keeps alive."""
+    """Take a lease as `Store.lease` says: an advisory lock, which this process keeps alive."""
     with ExitStack() as opened:
         opened.enter_context(database.writing())
         lock = database.try_lock(f"lease/{name}")

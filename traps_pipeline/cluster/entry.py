@@ -1,6 +1,6 @@
-"""What the other rooms ask of this one: see `storage/several_hosts.py`, by which they find it.
+"""The interface of this room for the others: see `storage/several_hosts.py`, which imports it by name.
 
-What stands above the storage is imported in functions: it opens the study while it is imported.
+Modules above the storage are imported in functions: importing them opens the study.
 """
 
 from __future__ import annotations

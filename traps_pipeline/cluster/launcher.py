@@ -1,4 +1,4 @@
-"""The launcher of runs on Ray, which `dagster.yaml` names: dagster-ray's own, through `cluster/node.py`."""
+"""The launcher of runs on Ray that `dagster.yaml` names: dagster-ray's own, through `cluster/node.py`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ClusterLauncher(RayRunLauncher):
         return _NodeClient(self.address, metadata=self.metadata, headers=self.headers, cookies=self.cookies)
 
     def launch_run(self, context: Any) -> None:
-        """Launch a run. One that Dagster's pages or sensors created gets the tags of one that a command asks for."""
+        """Launch a run. Runs from Dagster's pages or sensors first get the tags of runs from commands."""
         run = context.dagster_run
         if RESOURCES_TAG not in run.tags:
             tags = tags_of_page_run(run)
@@ -42,7 +42,7 @@ class ClusterLauncher(RayRunLauncher):
             super().launch_run(context)
 
     def resume_run(self, context: Any) -> None:
-        """Launch a run once more whose host died."""
+        """Launch a run again after its host died."""
         with self._answering(context.dagster_run):
             super().resume_run(context)
 
@@ -61,7 +61,7 @@ class ClusterLauncher(RayRunLauncher):
 class _NodeClient(JobSubmissionClient):
     """Submits a run's command through `cluster/node.py`, quoted for a shell.
 
-    dagster-ray 0.4.8 puts the run, as JSON, between single quotes without looking whether it holds some.
+    dagster-ray 0.4.8 puts the run, as JSON, between single quotes without escaping.
     """
 
     def submit_job(self, *, entrypoint: str, metadata: dict[str, str] | None = None, **options: Any) -> str:
@@ -74,12 +74,12 @@ class _NodeClient(JobSubmissionClient):
 def node_command(entrypoint: str, run_id: str) -> str:
     """Return the command line of a run's job, for dagster-ray's `dagster api .. '{..}'`."""
     command, _, run = entrypoint.partition(" '")
-    _, *arguments = command.split()  # without the `dagster` of the host that launches it
+    _, *arguments = command.split()  # without the launching host's `dagster`
     return shlex.join(["python", "-P", "-m", "traps_pipeline.cluster.node", run_id, *arguments, run.removesuffix("'")])
 
 
 def tags_of_page_run(run: dg.DagsterRun) -> dict[str, str]:
-    """Return the tags that `traps run --cluster` would have given a run of Dagster's pages, or of its sensors."""
+    """Return the tags that `traps run --cluster` would give a run of Dagster's pages or sensors."""
     import traps_pipeline.definitions  # noqa: F401 - declares the stages, which the daemon's process has not loaded
 
     workspace, declared = Workspace.open(), the_graph().declared

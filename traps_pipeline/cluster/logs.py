@@ -1,8 +1,8 @@
-"""What runs print, where a study lies in an object store: Dagster's pages on the head show it.
+"""Upload what runs print to the study's object store, so that Dagster's pages on the head can show it.
 
-A node captures it in a folder of its own and brings it to the store every UPLOAD_S and when the run ends, so that of a
-host that died all but the last moments is there. The head fetches it. These are the only objects with names of their
-own that change; nothing is decided from them.
+A node captures the output in a local folder and uploads it every UPLOAD_S and when the run ends, so that of a dead host
+only the last moments are lost. The head fetches it. These are the only objects with names of their own that change; no
+decision depends on them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from traps_pipeline.cluster.shared_history import logs_folder
 from traps_pipeline.storage.workspace import Workspace
 
 UPLOAD_S = 30.0
-PREFIX = "logs"  # in the store
+PREFIX = "logs"  # prefix in the store
 
 
 @contextmanager
 def uploading(workspace: Workspace, run_id: str) -> Iterator[None]:
-    """Bring what a run prints to the study's store, within the block and at its end."""
+    """Upload a run's output to the study's store, within the block and at its end."""
     if not isinstance(workspace.place, str):
         yield  # all hosts see the folder
         return
@@ -47,8 +47,10 @@ def uploading(workspace: Workspace, run_id: str) -> Iterator[None]:
 
 
 def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) -> None:
-    """Bring files of a run's logs to the store that have grown. sizes: of what was brought, by file. A store that does
-    not answer does not end the run."""
+    """Upload files of a run's logs that have grown. sizes: uploaded bytes, by file.
+
+    An unreachable store does not end the run.
+    """
     try:
         for path in (folder / run_id).rglob("*.*"):
             content = path.read_bytes()
@@ -60,7 +62,7 @@ def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) ->
 
 
 def fetch(bucket: Bucket, folder: Path) -> None:
-    """Bring all logs from the store into a folder that it has not, or not whole. Raises TrapsError."""
+    """Fetch all missing or incomplete logs from the store into a folder. Raises TrapsError."""
     for name, size, _ in bucket.names(PREFIX):
         path = folder / Path(name).relative_to(PREFIX)
         if path.resolve().is_relative_to(folder.resolve()) and (not path.exists() or path.stat().st_size != size):

@@ -1,9 +1,9 @@
-"""Runs that wait for a host, and those that wait for nothing.
+"""Detect runs that will never begin, as opposed to those that wait for a host.
 
-A run that left the queue is STARTING until its process says that it has begun. On a cluster that takes as long as all
-hosts are busy, or as a new one needs to come up, so Dagster's own limit on it (`start_timeout_seconds`) would end runs
-that nothing is wrong with. Ray knows whether a run waits for a host; Dagster asks it of runs that have begun alone. A
-sensor asks it of the others.
+A run that has left the queue is STARTING until its process reports that it has begun. On a cluster that takes as long
+as all hosts are busy, or as a new one needs to start, so Dagster's own limit on it (`start_timeout_seconds`) would end
+healthy runs. Ray knows whether a run waits for a host; Dagster asks Ray only about runs that have begun, and a sensor
+about the others.
 """
 
 from __future__ import annotations
@@ -18,19 +18,22 @@ from traps_pipeline.cluster.logs import fetch
 from traps_pipeline.cluster.shared_history import logs_folder
 from traps_pipeline.storage.workspace import Workspace
 
-LOST_S = 90  # after so long a run that Ray knows nothing of was never submitted, or Ray's head lost it
+LOST_S = 90  # a run unknown to Ray for so long was never submitted, or Ray's head lost it
 INTERVAL_S = 15
 _BEFORE = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
 
 
 def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list[str]:
-    """Mark runs as failed that will never begin; return their ids. Raises OSError while Ray's head does not answer."""
+    """Mark runs as failed that will never begin; return their ids.
+
+    Raises OSError while Ray's head does not answer.
+    """
     failed = list[str]()
     for record in instance.get_run_records(dg.RunsFilter(statuses=_BEFORE)):
         run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s
         if why := _why_lost(instance, run, is_old=is_old):
             now = instance.get_run_by_id(run.run_id)
-            if now is not None and now.status == run.status:  # it may have begun since
+            if now is not None and now.status == run.status:  # it may have begun in the meantime
                 instance.report_run_failed(now, f"the run will not begin: {why}")
                 failed.append(run.run_id)
     return failed
@@ -52,7 +55,7 @@ def _why_lost(instance: dg.DagsterInstance, run: dg.DagsterRun, *, is_old: bool)
     "before they began; those that wait for a host go on waiting. Fetches what runs print from the study's store.",
 )
 def end_lost_runs(context: dg.SensorEvaluationContext) -> dg.SkipReason:
-    """Mark runs as failed that a cluster has lost."""
+    """Mark runs that a cluster has lost as failed."""
     workspace = Workspace.open()
     try:
         failed = fail_lost_runs(context.instance)

@@ -1,7 +1,7 @@
-"""A run on its node: `python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`, which Ray starts.
+"""A run on its node: `python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`, started by Ray.
 
-Before Dagster's own command begins, in this process, it is checked that this host has the same code and can open the
-study. Otherwise the run fails with a sentence that names the host, and is not tried again.
+Before Dagster's own command begins, this process checks that the host has the same code and can open the study.
+Otherwise the run fails with a sentence that names the host, and is not retried.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from traps_pipeline.cluster.same_code import CODE, require_same_code
 from traps_pipeline.cluster.shared_history import export
 from traps_pipeline.storage.workspace import Workspace
 
-REFUSED_TAG = "traps/refused"  # of a run that its node did not begin
+REFUSED_TAG = "traps/refused"  # tag of a run that its node refused
 
 
 def main() -> None:
-    """Execute a run, and bring what it prints to the study's store. Ends with Dagster's exit code."""
+    """Execute a run, upload its output to the study's store, and exit with Dagster's exit code."""
     run_id, *command = sys.argv[1:]
     try:
         workspace = Workspace.open()
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _refuse(run_id: str, error: TrapsError) -> NoReturn:
-    with suppress(TrapsError):  # then the head hears of it from Ray
+    with suppress(TrapsError):  # then the head learns of it from Ray
         from traps_pipeline.pipeline.run import dagster_history  # reads registries, which may differ, too
 
         with dagster_history(Workspace.open()) as instance:

@@ -1,7 +1,7 @@
-"""Which object is current under each path of a study: rows of the database that holds its ledger.
+"""Map a study's paths to their current objects, in rows of the database that holds its ledger.
 
-The rows of one change are written in one transaction. Changes are numbered, under a lock until they are committed, so
-that a process which asks for what is newer than the last number that it has seen overlooks nothing.
+The rows of one change are written in one transaction. Changes are numbered, under a lock that lasts until the commit,
+so that a process that asks for changes after the last number it has seen misses none.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from sqlalchemy.dialects.postgresql import insert
 
 from traps_pipeline.cluster.cluster_database import Database
 
-MANY = ("clips/", "media/")  # of which a process knows only what it has asked for: there may be millions
-FRESH_S = 0.5  # a look at the rows that is younger is not repeated
-REMOVAL_S = 15.0  # after so long under its lock a process was stopped, and removes nothing
-_TABLES_LOCK = 7_206_551_933  # of PostgreSQL, while a process creates the tables
+MANY = ("clips/", "media/")  # folders whose names are only looked up one by one: there may be millions
+FRESH_S = 0.5  # minimum age of the last look before the rows are read again
+REMOVAL_S = 15.0  # a process that held its lock for longer was suspended, and removes nothing
+_TABLES_LOCK = 7_206_551_933  # PostgreSQL's lock while a process creates the tables
 _METADATA = sa.MetaData()
-# removals: how often objects were removed; a content that was brought to the store before may be among them.
+# removals: the number of removals so far; content uploaded earlier may have been removed by one.
 _CHANGES = sa.Table(
     "traps_changes",
     _METADATA,
@@ -36,19 +36,21 @@ _OBJECTS = sa.Table(
     _METADATA,
     sa.Column("study", sa.Text, primary_key=True),
     sa.Column("name", sa.Text, primary_key=True),
-    sa.Column("digest", sa.LargeBinary),  # none: nothing is current under the name any more
+    sa.Column("digest", sa.LargeBinary),  # null: the name was removed
     sa.Column("size", sa.BigInteger),
     sa.Column("note", sa.Text),
-    sa.Column("number", sa.BigInteger, nullable=False),  # of the change
+    sa.Column("number", sa.BigInteger, nullable=False),  # number of the change
     sa.Column("at", sa.DateTime(timezone=True), nullable=False, server_default=sa.func.clock_timestamp()),
     sa.Index("traps_objects_number", "study", "number"),
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Current:
-    """What is current under a path: the object's SHA-256 and size in bytes, the note, and when it was named (ns since
-    1970; 0 for one that is yet to be named)."""
+class CurrentObject:
+    """The current object of a path: SHA-256, size in bytes, note, and time of the change.
+
+    The time is in ns since 1970; 0 for an object that is yet to be named.
+    """
 
     digest: bytes
     size: int
@@ -56,28 +58,28 @@ class Current:
     at_ns: int = 0
 
 
-class Names:
-    """The names of a study's files. Threads may share it."""
+class ObjectNames:
+    """The paths of a study's files and their current objects. Thread-safe."""
 
     def __init__(self, database: Database, study: str) -> None:
         self._database, self._study = database, study
-        self._rows: dict[str, Current] = {}
+        self._rows: dict[str, CurrentObject] = {}
         self._sorted: list[str] = []  # names of these rows
-        self._asked = set[str]()  # names in MANY that were looked up; of later changes every host hears anyhow
+        self._asked = set[str]()  # names in MANY that were looked up; later changes arrive in any case
         self._number, self._looked_at = -1, float("-inf")
         self._guard = threading.RLock()
-        self.removals = 0  # as far as this process has seen
+        self.removals = 0  # the last change that this process has seen
         database.run(_create_tables)
 
     def look(self, age_s: float = 0.0) -> None:
-        """See what other hosts have changed, unless this process looked less than `age_s` ago."""
+        """Read other hosts' changes, unless this process did so less than `age_s` ago."""
         with self._guard:
             if time.monotonic() - self._looked_at <= age_s:
                 return
             began, is_first = time.monotonic(), self._number < 0
 
             def work(connection: sa.Connection) -> tuple[Any, Sequence[Any]]:
-                # The number first: what is committed after it is seen, or seen once more the next time.
+                # Read the number first: later commits are seen now or, once more, the next time.
                 change = connection.execute(sa.select(_CHANGES).where(_CHANGES.c.study == self._study)).one_or_none()
                 few = sa.and_(*(~_OBJECTS.c.name.startswith(folder) for folder in MANY))
                 return change, self._select(connection, few if is_first else _OBJECTS.c.number > self._number)
@@ -101,10 +103,10 @@ class Names:
             if row.name not in self._rows:
                 insort(self._sorted, row.name)
             at_ns = int(row.at.timestamp() * 1e6) * 1000
-            self._rows[row.name] = Current(bytes(row.digest), row.size, row.note, at_ns)
+            self._rows[row.name] = CurrentObject(bytes(row.digest), row.size, row.note, at_ns)
 
-    def current(self, names: Collection[str]) -> dict[str, Current]:
-        """Return what is current under these names, as far as something is."""
+    def current(self, names: Collection[str]) -> dict[str, CurrentObject]:
+        """Return the current objects of these names, if they have one."""
         with self._guard:
             self.look(FRESH_S)
             if new := sorted({name for name in names if name.startswith(MANY)} - self._asked):
@@ -113,7 +115,7 @@ class Names:
             return {name: self._rows[name] for name in names if name in self._rows}
 
     def below(self, folder: str) -> list[str]:
-        """Return the names below a folder, in order."""
+        """Return the names below a folder, sorted."""
         start, end = f"{folder}/", f"{folder}0"  # 0 comes after /
         with self._guard:
             self.look(FRESH_S)
@@ -123,15 +125,15 @@ class Names:
             return self._sorted[bisect_left(self._sorted, start) : bisect_left(self._sorted, end)]
 
     def naming(self, digests: Collection[bytes] | None = None) -> dict[str, bytes]:
-        """Return the names of all objects (of these), with their digests, as the database has them."""
+        """Return the names of all objects (or only these), with their digests, from the database."""
         condition = _OBJECTS.c.digest.is_not(None) if digests is None else _OBJECTS.c.digest.in_(digests)
         return {row.name: bytes(row.digest) for row in self._database.run(lambda c: self._select(c, condition))}
 
-    def change(self, changed: Mapping[str, Current | None], removals: int) -> int:
-        """Let objects be current under these names, or nothing, all in one transaction; return `removals`.
+    def change(self, changed: Mapping[str, CurrentObject | None], removals: int) -> int:
+        """Set or remove the current objects of these names in one transaction; return `removals`.
 
-        removals: how many there were before the objects were brought to the store. Where there are more by now, nothing
-        is changed, and their number is returned: bring the objects once more.
+        removals: the number of removals before the objects were uploaded. If there are more by now, nothing is changed,
+        and their number is returned: upload the objects again.
         """
         values = [
             {"study": self._study, "name": name, "digest": None, "size": None, "note": None}
@@ -157,8 +159,10 @@ class Names:
         return now
 
     def _next_change(self, connection: sa.Connection, *, removals: int = 0) -> tuple[int, int]:
-        """Return the number of a change, and how many removals there were. Until the transaction ends no other process
-        changes names or removes objects."""
+        """Return the number of a change, and the number of removals.
+
+        Until the transaction ends no other process changes names or removes objects.
+        """
         upsert = insert(_CHANGES).values(study=self._study, number=1, removals=removals)
         upsert = upsert.on_conflict_do_update(
             index_elements=["study"],
@@ -168,8 +172,10 @@ class Names:
         return row.number, row.removals
 
     def remove(self, digests: Collection[bytes], delete: Callable[[Sequence[bytes]], None]) -> list[bytes]:
-        """Delete objects but for those that are named by now; return which. No object is named meanwhile, and a process
-        that has brought one to the store before brings it again."""
+        """Delete objects, except those that are named by now; return the deleted ones.
+
+        No object is named meanwhile, and a process that has uploaded one earlier uploads it again.
+        """
 
         def work(connection: sa.Connection) -> list[bytes]:
             began = time.monotonic()
@@ -177,7 +183,7 @@ class Names:
             named = {bytes(row.digest) for row in self._select(connection, _OBJECTS.c.digest.in_(digests))}
             unnamed = [digest for digest in digests if digest not in named]
             if time.monotonic() - began > REMOVAL_S:
-                return []  # the server may have ended the session meanwhile, and with it the lock
+                return []  # the server may have ended the session, and thus the lock, meanwhile
             delete(unnamed)
             return unnamed
 

@@ -1,8 +1,8 @@
 """A study's files in an object store (S3, Google, Azure), for several hosts.
 
-An object is written once, under the SHA-256 of its content, and never renamed; `object_names.py` says which is current
-under a path. A host keeps what it has fetched in its scratch folder, below `.objects` under the same digests, and links
-it to the paths that people and code know. What is read has the size and the digest of its row.
+An object is written once, under the SHA-256 of its content, and never renamed; `object_names.py` maps paths to objects.
+A host caches what it has fetched in its scratch folder, below `.objects` under the same digests, and links it to the
+paths that people and code use. Size and digest of every read content are compared with its row.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.cluster.bucket import Bucket, object_name
 from traps_pipeline.cluster.cluster_database import Database, lease
-from traps_pipeline.cluster.object_names import Current, Names
+from traps_pipeline.cluster.object_names import CurrentObject, ObjectNames
 from traps_pipeline.storage.place import STUDY
 from traps_pipeline.storage.store import GRACE_DAYS, Lease, Store, UnusedObject, is_hidden
 
@@ -27,23 +27,23 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 OBJECTS = ".objects"  # in a scratch folder: contents by digest
-AT_ONCE = 16  # transfers side by side
-BATCH = 1000  # objects that are removed by one request
+AT_ONCE = 16  # concurrent transfers
+BATCH = 1000  # objects removed per request
 _OBJECT = re.compile(r"([0-9a-f]{2})/(\1[0-9a-f]{62})")
 
 
 class ObjectStore(Store):
-    """Files of a study whose contents lie in a bucket and whose names lie in its database. Threads may share it.
+    """Files of a study whose contents lie in a bucket and whose names lie in its database. Thread-safe.
 
-    anchor: the content of the one object with a name, which says where the study's database is.
+    anchor: the content of the only object with a fixed name, which locates the study's database.
     """
 
     def __init__(self, root: Path, bucket: Bucket, database: Database, study: str, anchor: bytes) -> None:
         super().__init__(root)
         self.bucket, self._database, self._study, self._anchor = bucket, database, study, anchor
-        self.names = Names(database, study)
-        self._stored = set[tuple[bytes, int]]()  # digests of objects seen in the store, with `removals` by then
-        self._verified = set[bytes]()  # digests of contents in the scratch folder that were compared with these
+        self.names = ObjectNames(database, study)
+        self._stored = set[tuple[bytes, int]]()  # digests of objects seen in the store, with `removals` at that time
+        self._verified = set[bytes]()  # verified digests of contents in the scratch folder
 
     def look(self) -> None:
         """See `Store`."""
@@ -52,15 +52,15 @@ class ObjectStore(Store):
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
-    def _known(self, paths: Iterable[Path]) -> dict[Path, Current]:
+    def _known(self, paths: Iterable[Path]) -> dict[Path, CurrentObject]:
         names = {path: self._name(path) for path in paths}
         current = self.names.current({*names.values()})
         return {path: current[name] for path, name in names.items() if name in current}
 
-    def _current(self, path: Path) -> Current | None:
+    def _current(self, path: Path) -> CurrentObject | None:
         return self._known([path]).get(path)
 
-    def _change(self, changed: Mapping[Path, Current | None], removals: int) -> None:
+    def _change(self, changed: Mapping[Path, CurrentObject | None], removals: int) -> None:
         named = {self._name(path): row for path, row in changed.items()}
         while (now := self.names.change(named, removals)) != removals:
             removals = now
@@ -69,7 +69,7 @@ class ObjectStore(Store):
                     self.bucket.put(object_name(row.digest), self._cached(row.digest).read_bytes())
 
     def _withdraw(self, lost: Iterable[bytes]) -> None:
-        """Let objects that are gone, or altered, be current no more: what needs them is made again."""
+        """Remove the names of lost or altered objects, so that their dependents are rebuilt."""
         gone = {*lost}
         self._stored = {seen for seen in self._stored if seen[0] not in gone}
         named = self.names.naming(gone)
@@ -95,8 +95,8 @@ class ObjectStore(Store):
     def _is_stored(self, digest: bytes) -> bool:
         return (digest, self.names.removals) in self._stored
 
-    def _put(self, content: bytes, row: Current | None, removals: int) -> bytes:
-        """Bring a content to the store, unless it is what is current and is seen there; return its digest."""
+    def _put(self, content: bytes, row: CurrentObject | None, removals: int) -> bytes:
+        """Upload a content, unless it is current and still in the store; return its digest."""
         digest = sha256(content).digest()
         is_current = row is not None and row.digest == digest
         if not (is_current and (self._is_stored(digest) or self.bucket.size(object_name(digest)) == len(content))):
@@ -104,8 +104,8 @@ class ObjectStore(Store):
         self._stored.add((digest, removals))
         return digest
 
-    def _fetched(self, row: Current, path: Path) -> Path:
-        """Return the content of an object in the scratch folder. Raises TrapsError where it is gone or altered."""
+    def _fetched(self, row: CurrentObject, path: Path) -> Path:
+        """Return the content of an object in the scratch folder. Raises TrapsError if it is lost or altered."""
         if self._is_cached(row.digest):
             return self._cached(row.digest)
         removals, content = self.names.removals, self.bucket.get(object_name(row.digest))
@@ -124,9 +124,9 @@ class ObjectStore(Store):
         return self._fetched(row, path)
 
     def bring(self, paths: Iterable[Path]) -> None:
-        """See `Store`. What is gone from the store and lies at its path still is left there."""
+        """See `Store`. A local file whose object is lost from the store stays."""
 
-        def one(known: tuple[Path, Current]) -> None:
+        def one(known: tuple[Path, CurrentObject]) -> None:
             path, row = known
             cached = self._cached(row.digest)
             if not self._is_cached(row.digest) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
@@ -136,7 +136,7 @@ class ObjectStore(Store):
                     link(self._fetched(row, path), path)
             except TrapsError:
                 if self._current(path) is not None:
-                    raise  # the store cannot be reached; where it has no such object, nobody has
+                    raise  # the store is unreachable, so a missing object cannot be told from a lost one
 
         _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
 
@@ -145,7 +145,7 @@ class ObjectStore(Store):
         names = {*paths}
         known, removals = self._known(names), self.names.removals
 
-        def one(path: Path) -> tuple[Path, Current] | None:
+        def one(path: Path) -> tuple[Path, CurrentObject] | None:
             row = known.get(path)
             if row is not None and self._is_stored(row.digest) and is_same_file(path, self._cached(row.digest)):
                 return None
@@ -153,7 +153,7 @@ class ObjectStore(Store):
             digest = self._put(content, row, removals)
             link(path, self._cached(digest))
             self._verified.add(digest)
-            return None if row is not None and row.digest == digest else (path, Current(digest, len(content)))
+            return None if row is not None and row.digest == digest else (path, CurrentObject(digest, len(content)))
 
         self._change(dict(pair for pair in _side_by_side(one, names) if pair is not None), removals)
 
@@ -161,10 +161,10 @@ class ObjectStore(Store):
         """See `Store`."""
         known, removals = self._known(files), self.names.removals
 
-        def one(path: Path) -> tuple[Path, Current]:
+        def one(path: Path) -> tuple[Path, CurrentObject]:
             digest = self._put(files[path], known.get(path), removals)
             self._cache(digest, files[path], durable=durable)
-            return path, Current(digest, len(files[path]), note)
+            return path, CurrentObject(digest, len(files[path]), note)
 
         self._change(dict(_side_by_side(one, files)), removals)
         self.bring(files)
@@ -185,14 +185,14 @@ class ObjectStore(Store):
         return self._current(path) is not None
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """See `Store`. Each object is looked for in the store, once a process."""
+        """See `Store`. Each object is checked in the store, once per process."""
         rows, removals = self._known(paths), self.names.removals
         unseen = {row.digest: row for row in rows.values() if not self._is_stored(row.digest)}
         sizes = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), unseen))
         lost = {digest for digest, size in sizes.items() if size != unseen[digest].size}
         self._stored |= {(digest, removals) for digest in sizes.keys() - lost}
         if lost:
-            self.bucket.get(object_name(next(iter(lost))))  # tells a bucket that is gone from one without this object
+            self.bucket.get(object_name(next(iter(lost))))  # tells a missing bucket from one without this object
             self._withdraw(lost)
         return {path: row.size for path, row in rows.items() if row.digest not in lost}
 
@@ -250,12 +250,12 @@ class ObjectStore(Store):
 
 
 def _regex(pattern: str) -> str:
-    """Return what a pattern of `pathlib` means, as far as it is used here: `*` within a name, `**/` for any folders."""
+    """Return a regular expression for the `pathlib` patterns used here: `*` within a name, `**/` for any folders."""
     return re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*").replace(r"\*", "[^/]*")
 
 
 def _side_by_side(work: Callable[[T], R], of: Iterable[T]) -> list[R]:
-    """Return what `work` returns of each, several at once."""
+    """Return the results of `work` for each element, computed concurrently."""
     each = list(of)
     if len(each) < 2:
         return [work(one) for one in each]

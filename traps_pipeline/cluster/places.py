@@ -1,4 +1,4 @@
-"""The files of a study that several hosts see: in a folder, or at an address in an object store."""
+"""Open the files of a study on several hosts: in a shared folder, or at an address in an object store."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ _HEAD = "# A study of TRAPSBench. Its own study.yaml, and the names of its files
 
 
 class SharedFolder(FolderStore):
-    """A folder that all hosts of a study see. Which of them has a piece of work, the database says: locks on files are
-    those of one machine on some file systems."""
+    """A folder that all hosts of a study share.
+
+    Leases are in the database: on some file systems, file locks are local to one machine.
+    """
 
     def __init__(self, root: Path, database: Database) -> None:
         super().__init__(root)
@@ -32,8 +34,10 @@ class SharedFolder(FolderStore):
 
 
 def open_store(place: Place, root: Path, study: Study | None = None) -> Store | None:
-    """See `SeveralHosts`. In an object store the one object with a name says which study lies there, and the variable
-    that holds the address of its database."""
+    """See `SeveralHosts`. In an object store, the only object with a fixed name identifies the study.
+
+    It also names the variable that holds the address of its database.
+    """
     if study is not None:
         name, variable = study.name, str(study.database)
         if isinstance(place, Path):
@@ -57,6 +61,6 @@ def _bucket(address: str) -> Bucket:
 
 @cache
 def _store(root: Path, address: str, database: Database, name: str, variable: str) -> ObjectStore:
-    """Return the store of a process: what it has seen is not looked at again when the workspace is opened once more."""
+    """Return the process's cached store, so that reopening a workspace does not read everything again."""
     anchor = _HEAD + yaml.safe_dump({"format": FORMAT, "name": name, "database": variable}, sort_keys=False)
     return ObjectStore(root, _bucket(address), database, name, anchor.encode())

@@ -1,8 +1,8 @@
-"""Runs on other hosts: `traps run EXPERIMENT --cluster` asks for them, and Dagster's daemon starts them on Ray.
+"""Run stages on other hosts: `traps run EXPERIMENT --cluster` requests runs, Dagster's daemon starts them on Ray.
 
-The head of the cluster runs Dagster's daemon (`traps ui`), which creates the runs that a command asks for, starts them
-as Ray jobs and resumes those whose host died. This module cuts what is missing into ranges, asks for their runs, and
-reports what they do.
+The head of the cluster runs Dagster's daemon (`traps ui`), which creates the requested runs, starts them as Ray jobs
+and resumes those whose host died. This module cuts the missing partitions into ranges, requests their runs, and reports
+their progress.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, 
 from traps_pipeline.ledger.postgres import PATIENCE_S
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out
-from traps_pipeline.pipeline.runs import Ran, Runs, broke_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.pipeline.runs import RunOutcome, Runs, broke_off, problems_of, range_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, TALLY
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
 POLL_S = 1.0
-IDLE_S = 60.0  # after so long a person reads that runs wait for a host, or for the daemon
-ALIVE_S = 120  # a daemon that has been silent for longer is dead
-CREATED_S = 30.0  # a command that ends its runs waits so long for the daemon to create those that it asked for
+IDLE_S = 60.0  # waiting time before the user is told that runs wait for a host, or for the daemon
+ALIVE_S = 120  # a daemon silent for longer is presumed dead
+CREATED_S = 30.0  # when ending its runs, a command waits so long for the daemon to create the requested ones
 DAEMONS = ("QUEUED_RUN_COORDINATOR", "SENSOR")
-ENDS = 300  # letters of the beginning and of the end of a lost run's last message
+ENDS = 300  # characters of the beginning and of the end of a lost run's last message
 OnInterrupt = Literal["leave", "cancel"]
 _UNFINISHED = (
     dg.DagsterRunStatus.QUEUED,
@@ -49,8 +49,10 @@ _ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.
 
 
 def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
-    """Check that runs can be asked for from here: other hosts see the study, Ray's address is known, and a daemon takes
-    runs from the queue. Raises TrapsError."""
+    """Check that runs can be requested from this host. Raises TrapsError.
+
+    Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
+    """
     where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
     if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
         raise TrapsError(
@@ -77,8 +79,11 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
 
 
 class RayRuns(Runs):
-    """Runs of a study in Dagster's queue. most: into which a group of stages is cut. gpus: of each run that loads a
-    local model. cpus: of each run that works on as many as it is given."""
+    """Runs of a study in Dagster's queue.
+
+    most: maximum number of ranges per group of stages. gpus: of each run that loads a local model. cpus: of each run
+    that can use several.
+    """
 
     def __init__(
         self,
@@ -93,13 +98,13 @@ class RayRuns(Runs):
         self._most, self._gpus, self._cpus = most, gpus, cpus
         self._idle_since, self._is_reported_idle = float("inf"), False  # while all runs wait for a host
         self._keys = frozenset[str | None]()
-        # Stages and tags by name: of runs that are asked for once more if they break off.
+        # Stages and tags by name, to request a run again if it breaks off.
         self._requests: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
         self._cursors: dict[str, str | None] = {}
-        self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
+        self._failures: dict[str, list[dg.DagsterEvent]] = {}  # failed steps of runs
 
     def wait_for_earlier(self) -> None:
-        """Wait for runs that an earlier command left."""
+        """Wait for runs of earlier commands."""
         ours = dg.RunsFilter(statuses=[*_UNFINISHED], tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(ours)]:
             progress.current().note(f"{len(runs)} runs of this study go on that were left; waiting for them first")
@@ -107,9 +112,11 @@ class RayRuns(Runs):
             self._watch([], [run.run_id for run in runs])
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
-        """Return ranges for several hosts: so many that all have work, and so few that starting them costs little. What
-        one model is asked stays together, so that it is loaded in few runs. Runs that share what they make may have the
-        same range."""
+        """Return ranges for several hosts: enough to keep all busy, and few enough to limit start-up costs.
+
+        The calls of one model stay together, so that few runs load it. Runs that build partitions together may have the
+        same range.
+        """
         self._keys = frozenset(keys)
         scheme = stages[0].scheme if stages else None
         shared = [stage.shared for stage in stages if stage.shared is not None]
@@ -118,7 +125,7 @@ class RayRuns(Runs):
         seconds = {key: sum(one.seconds(self._workspace, key) for one in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
 
-    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
         if ranges:
             progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
@@ -136,10 +143,12 @@ class RayRuns(Runs):
     def _submit(self, stages: Sequence[str], tags: Mapping[str, str]) -> str:
         return submit(self._instance, self._workspace.study.name, stages, tags)
 
-    def _watch(self, requests: list[str], run_ids: list[str]) -> list[Ran]:
-        """Report what runs do until all have ended: those that were asked for by these names, and those of these ids.
-        While the database is away, for as long as runs themselves wait for it, they are not given up."""
-        done, seen_at = list[Ran](), time.monotonic()
+    def _watch(self, requests: list[str], run_ids: list[str]) -> list[RunOutcome]:
+        """Report the progress of requested and existing runs until all have ended.
+
+        An unreachable database ends this only after runs themselves would give up on it.
+        """
+        done, seen_at = list[RunOutcome](), time.monotonic()
         try:
             while requests or run_ids:
                 try:
@@ -155,9 +164,11 @@ class RayRuns(Runs):
             raise
         return done
 
-    def _look_at(self, requests: list[str], run_ids: list[str], done: list[Ran]) -> None:
-        """Report what these runs have done since the last time. Requests that have runs become these; what came of runs
-        that have ended is added to `done`."""
+    def _look_at(self, requests: list[str], run_ids: list[str], done: list[RunOutcome]) -> None:
+        """Report these runs' progress since the last call.
+
+        Created runs replace their requests; the results of ended runs are added to `done`.
+        """
         self._take_created(requests, run_ids)
         runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=run_ids))} if run_ids else {}
         self._report_waiting(requests, [*runs.values()])
@@ -176,13 +187,13 @@ class RayRuns(Runs):
                 done.append(self._ended(run_id, run, failures))
 
     def _take_created(self, requests: list[str], run_ids: list[str]) -> None:
-        """Let runs that were created take the place of their requests."""
+        """Replace requests by the runs created from them."""
         for run in self._instance.get_runs(dg.RunsFilter(tags={REQUEST_TAG: requests})) if requests else ():
             requests.remove(run.tags[REQUEST_TAG])
             run_ids.append(run.run_id)
 
     def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
-        """Say once that nothing has begun for a while: no host has what a run takes, or the daemon creates none."""
+        """Report once that nothing has begun for a while: no host has the resources, or the daemon creates no runs."""
         waiting = [run for run in runs if run.status == dg.DagsterRunStatus.STARTING]
         if not (waiting or requests) or any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
             self._idle_since = float("inf")
@@ -200,7 +211,7 @@ class RayRuns(Runs):
         progress.current().note(f"{len(waiting or requests)} runs have waited {IDLE_S:.0f} s for {needs}; {where}")
 
     def _report(self, run_id: str) -> None:
-        """Report partitions that a run has made since the last time, and remember steps that failed."""
+        """Report partitions that a run has built since the last call, and record failed steps."""
         has_more = True
         while has_more:
             cursor, kinds = self._cursors.get(run_id), {_WRITTEN, _FAILED}
@@ -219,10 +230,10 @@ class RayRuns(Runs):
                     else:
                         progress.current().partition(stored.asset_key.path[-1], stored.partition or "", tally)
 
-    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> Ran:
+    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
-            return Ran([f"{name} is in Dagster's history no more"], over_budget=False)
+            return RunOutcome([f"{name} is in Dagster's history no more"], over_budget=False)
         outcome = problems_of([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
         if run.status != dg.DagsterRunStatus.SUCCESS and not outcome.problems:
             message = " ".join(self._last_message(run_id).split())
@@ -233,10 +244,10 @@ class RayRuns(Runs):
         return outcome
 
     def _last_message(self, run_id: str) -> str:
-        """Return why a run ended whose steps do not say it: an error of its launcher, or its last event's message."""
+        """Return why a run ended if its steps do not say so: its launcher's error, or its last event's message."""
         logged = [entry.dagster_event for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
         events = [event for event in logged if event is not None]
-        for event in events[-2:]:  # that a run could not be started stands right before its end
+        for event in events[-2:]:  # a failed start is recorded right before the run's end
             if event.is_engine_event and event.engine_event_data.error:
                 return reason(event.engine_event_data.error)
         messages = [event.message for event in events if not event.is_engine_event and event.message]
@@ -260,7 +271,7 @@ class RayRuns(Runs):
 
 
 def _partitions(run: dg.DagsterRun) -> int:
-    """Return how many partitions a run is to make, those of all its stages."""
+    """Return the number of partitions that a run is to build, over all its stages."""
     graph = the_graph()
     selected = [graph[key.path[-1]] for key in run.asset_selection or ()]
     return sum(len(keys_in([stage], range_of(run.tags))) or 1 for stage in selected)

@@ -1,4 +1,4 @@
-"""Runs that a command asks for, on whatever host, and that Dagster's daemon on the head creates.
+"""Requests for runs on any host, which Dagster's daemon on the head turns into runs.
 
 A request is an observation in the shared history, so it outlives the command, the daemon and the head. A sensor turns
 each into a run in Dagster's queue, once: its `run_key` is the request's name.
@@ -17,13 +17,13 @@ from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.storage.workspace import Workspace
 
 REQUEST_TAG = "traps/request"
-INTERVAL_S = 1  # Dagster's daemon looks at sensors every 5 s
-AT_ONCE = 100  # requests that one tick turns into runs
+INTERVAL_S = 1  # Dagster's daemon evaluates sensors every 5 s
+AT_ONCE = 100  # requests turned into runs per tick
 _BODY = "run"
 
 
 def submit(instance: dg.DagsterInstance, study: str, stages: Sequence[str], tags: Mapping[str, str]) -> str:
-    """Ask for a run of stages, with these tags; return the request's name, which the run has as its `REQUEST_TAG`."""
+    """Request a run of stages with these tags; return the request's name, which becomes the run's `REQUEST_TAG`."""
     name = secrets.token_hex(8)
     body = {"name": name, "stages": [*stages], "tags": dict(tags)}
     instance.report_runless_asset_event(dg.AssetObservation(_key(study), metadata={_BODY: json.dumps(body)}))
@@ -53,7 +53,7 @@ def _run_request(record: dg.EventLogRecord) -> dg.RunRequest:
     description="Puts the runs into the queue that `traps run --cluster` asks for.",
 )
 def start_requested_runs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
-    """Start the runs that a command asked a cluster for.
+    """Create the runs that commands have requested.
 
     The cursor has a place for each study: they may share a history.
     """

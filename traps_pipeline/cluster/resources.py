@@ -1,4 +1,4 @@
-"""What a run on another host says of itself: its study, the code that submitted it, and what Ray sets aside for it."""
+"""The tags of a run on another host: its study, the submitter's code, and the resources that Ray reserves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def own_tags(
 ) -> dict[str, str]:
     """Return the tags of a run on another host. No secrets: everybody can read them.
 
-    keys: the partitions that it is to make; cpus: of one that works on several cores; gpus: of one that loads a model.
+    keys: the partitions to build; cpus: of a run that can use several cores; gpus: of a run that loads a model.
     """
     takes: dict[str, Any] = {"num_cpus": cpus if any(stage.takes.each_gb for stage in stages) else 1}
     asks = RESPONSES.name in {stage.name for stage in stages} and any(map(_is_local, keys))
@@ -40,7 +40,7 @@ def own_tags(
 
 
 def keys_in(stages: Sequence[Stage], of: Range) -> Sequence[str]:
-    """Return the partitions of a range; none where the stages have none."""
+    """Return the partitions of a range; empty for stages without partitions."""
     scheme, (first, last) = stages[0].scheme if stages else None, of
     if scheme is None or first is None:
         return []

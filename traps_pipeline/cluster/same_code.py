@@ -1,4 +1,4 @@
-"""Whether two hosts run the same code: what is compared before a run of another host's begins."""
+"""Check that two hosts run the same code, before one executes the other's run."""
 
 from __future__ import annotations
 
@@ -13,23 +13,28 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
 
-CODE = "TRAPS_CODE"  # of a run: the code of the host that submitted it
+CODE = "TRAPS_CODE"  # tag of a run: the submitting host's code
 DISTRIBUTION = "traps-pipeline"
 _NAME, _NOT_FOR_RUNS = re.compile(r"[\w.-]+"), re.compile(r"extra == ['\"](dev|docs|sign|test)['\"]")
 
 
 @cache
 def code_here() -> str:
-    """Return this host's code, as JSON: digests of the package's own files and of those that people edit (`assets/`,
-    `scene_specs/`), and the versions of Python and of every package that `pyproject.toml` names and that is here."""
+    """Return this host's code, as JSON.
+
+    It has digests of the package's own files and of those that people edit (`assets/`, `scene_specs/`), and the
+    versions of Python and of every installed package that `pyproject.toml` names.
+    """
     folders = {"the package": PACKAGE, "assets": ASSETS, "scene_specs": SCENE_SPECS}
-    return json.dumps({f"files of {name}": _digest_of(folder) for name, folder in folders.items()} | installed())
+    return json.dumps(
+        {f"files of {name}": _digest_of(folder) for name, folder in folders.items()} | installed_versions()
+    )
 
 
-def installed() -> dict[str, str]:
-    """Return versions of Python, of this package, and of what it names, by name; what is not installed is left out.
+def installed_versions() -> dict[str, str]:
+    """Return installed versions of Python, of this package, and of its dependencies, by name.
 
-    Builds for other hardware (`+cpu`, `+cu128`) are the same version.
+    Builds for other hardware (`+cpu`, `+cu128`) count as the same version.
     """
     from importlib.metadata import PackageNotFoundError, requires, version
 
@@ -44,9 +49,10 @@ def installed() -> dict[str, str]:
 
 
 def require_same_code(submitted: str, study: str) -> None:
-    """Check that a run was submitted by a host with the same code, which `code_here` returned there. Raises TrapsError.
+    """Check that a run was submitted by a host with the same code. Raises TrapsError.
 
-    What only one of the two has installed is not compared: a host without a GPU need not have what a GPU wants.
+    submitted: the result of `code_here` there. Packages that only one of the two has are ignored: a host without a GPU
+    need not have a GPU's packages.
     """
     if not submitted:
         return

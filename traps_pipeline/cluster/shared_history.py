@@ -1,8 +1,7 @@
-"""Dagster's history and logs of a study whose runs go to Ray: what `dagster.yaml` says, and variables that it names.
+"""Dagster's history and logs of a study on Ray: its `dagster.yaml`, and the variables that this file names.
 
-The history lies in the PostgreSQL database of the study's ledger, in dagster-postgres's own storage. What runs print
-lies in a folder of each host: that of the study where all hosts see it, else one below the scratch folder
-(`cluster/logs.py`).
+The history lies in the PostgreSQL database of the study's ledger, in dagster-postgres's own storage. Runs' output lies
+in a folder of each host: that of the study if all hosts see it, else one below the scratch folder (`cluster/logs.py`).
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from sqlalchemy.engine import CreateEnginePlugin
 from traps_pipeline.base.keys import check_key
 from traps_pipeline.storage.workspace import RAY, Workspace
 
-HISTORY = "TRAPS_HISTORY"  # of a process: the database's address as Dagster's driver wants it; in no file
-LOGS = "TRAPS_LOGS"  # of a process: the folder of this host for what runs print
+HISTORY = "TRAPS_HISTORY"  # process variable: the database's address in the form of Dagster's driver; in no file
+LOGS = "TRAPS_LOGS"  # process variable: this host's folder for runs' output
 AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
 MONITOR_S, RESUMES = 15, 3
-START_S = 24 * 3600  # a run may wait so long for a host; one that waits for nothing ends sooner (`lost_runs.py`)
+START_S = 24 * 3600  # maximum wait for a host; a lost run ends sooner (`lost_runs.py`)
 _PLUGIN = "traps_kept"
 
 
@@ -39,7 +38,7 @@ def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
             "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1}},
         },
         "compute_logs": {
-            "module": "dagster._core.storage.local_compute_log_manager",  # as Dagster's documentation has it
+            "module": "dagster._core.storage.local_compute_log_manager",  # as in Dagster's documentation
             "class": "LocalComputeLogManager",
             "config": {"base_dir": {"env": LOGS}},
         },
@@ -49,15 +48,15 @@ def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
             "max_resume_run_attempts": RESUMES,
             "start_timeout_seconds": START_S,
         },
-        "sensors": {"use_threads": True, "num_workers": 4},  # one that looks through a large study holds no other up
+        "sensors": {"use_threads": True, "num_workers": 4},  # so that a slow sensor of a large study delays no other
         "concurrency": {"runs": {"max_concurrent_runs": AT_ONCE}},
     }
 
 
 def export(workspace: Workspace, *, is_kept: bool = False) -> None:
-    """Set the variables that `dagster.yaml` names, for this process and those that it starts.
+    """Set the variables that `dagster.yaml` names, for this process and its children.
 
-    is_kept: whether this process keeps its connections (`KeptConnections`), as one does that executes a run.
+    is_kept: whether this process keeps its connections (`KeptConnections`), as a process that executes a run does.
     """
     variable = str(workspace.study.database)
     address = os.environ[variable]  # the ledger was opened with it
@@ -72,13 +71,16 @@ def export(workspace: Workspace, *, is_kept: bool = False) -> None:
 
 
 def logs_folder(workspace: Workspace) -> Path:
-    """Return the folder of this host for what runs print."""
+    """Return this host's folder for runs' output."""
     return workspace.root / "cluster" / "logs"
 
 
 class KeptConnections(CreateEnginePlugin):
-    """Engines that keep one connection each. By itself dagster-postgres opens one for each statement, which takes two
-    fifths of the time of a run that asks models in small cells."""
+    """A SQLAlchemy plugin that keeps one connection per engine.
+
+    By default dagster-postgres opens one for each statement, which takes two fifths of the time of a run with small
+    cells.
+    """
 
     def __init__(self, url: URL, kwargs: dict[str, Any]) -> None:
         """Create the dialect; called by SQLAlchemy for an address that names this plugin."""

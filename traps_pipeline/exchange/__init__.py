@@ -1,1 +1,1 @@
-"""Batches of requests, and answers from elsewhere."""
+"""Exchange calls with other systems: export requests, batches and media, and import answers and votes."""

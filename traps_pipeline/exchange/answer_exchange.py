@@ -1,4 +1,4 @@
-"""Answers from elsewhere: from a cluster, or from a provider's batch mode.
+"""Exchange answers with other systems, such as a cluster or a provider's batch mode.
 
 `export_requests` writes the missing requests as JSON lines, with their media by digest; `import_answers` reads answers
 with the same keys and makes the same checks. Both files are data: nothing in them is executed or used unchecked.
@@ -22,7 +22,7 @@ from traps_pipeline.base.files import replacing, write_bytes
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
-from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, Given, reader_of
+from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
@@ -40,7 +40,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
-# How a text begins that a harness put in the place of an answer when its call failed.
+# Beginnings of texts that a harness stores as the answer of a failed call.
 _ERROR_TEXT = re.compile(
     r"\W*(?:(?:\w+\.)*(?:\w*error|\w*exception)\b\s*(?:code)?\s*[:(\[\d-]|traceback \(most recent|an error occurred"
     r"|(?:\w+\.)+exceptions?\.\w+\b"
@@ -87,7 +87,7 @@ class Answer(BaseModel):
         return self
 
     def as_outcome(self, entry: ModelEntry) -> Outcome:
-        """Return the outcome of the request, with its price from the registry."""
+        """Return the answer as an outcome, with its price from the registry."""
         fields = self.model_dump(exclude={"key", "outcome", "latency_s"})
         cost = None
         if entry.prices and self.prompt_tokens is not None and self.completion_tokens is not None:
@@ -96,9 +96,12 @@ class Answer(BaseModel):
 
 
 @dataclass(frozen=True)
-class Imported:
-    """The result of an import: the numbers of new answers, and of answers that the ledger had already; the calls that
-    failed, in words, which stay missing; the number of error messages that were left out."""
+class ImportResult:
+    """The result of an import.
+
+    It has the numbers of new answers and of answers already in the ledger; the failed calls, in words, which stay
+    missing; and the number of error messages left out.
+    """
 
     new: int
     known: int
@@ -108,7 +111,7 @@ class Imported:
 
 @dataclass(frozen=True)
 class _Stored:
-    """What came of a request, with the seconds that it took."""
+    """The outcome of a request, and its duration in seconds."""
 
     request: Request
     outcome: Outcome
@@ -116,18 +119,18 @@ class _Stored:
 
     @property
     def evaluation(self) -> Evaluation:
-        """The evaluation in whose ledger it stands."""
+        """The evaluation whose ledger holds it."""
         about = self.request.about
         return Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))
 
 
 def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
-    """Write the experiment's missing requests to `out` (requests.jsonl, and media/<sha256>.<suffix>); returns their
-    number.
+    """Write the experiment's missing requests to `out`; return their number.
 
-    A line holds key, model, provider_id, params, system, user, about (item, model, regime, run) and media: profile,
-    file, sha256, n_frames, times_s (s), fps. A local model's media is the clip itself: decode the frames at times_s.
-    Raises TrapsError when items are missing or `out` already holds an export.
+    `out` gets requests.jsonl, and media/<sha256>.<suffix>. A line holds key, model, provider_id, params, system, user,
+    about (item, model, regime, run) and media: profile, file, sha256, n_frames, times_s (s), fps. A local model's media
+    is the clip itself: decode the frames at times_s. Raises TrapsError if items are missing or `out` already holds an
+    export.
     """
     if (out / REQUESTS).exists():
         raise TrapsError(f"{out / REQUESTS} exists already; give another folder, or delete it")
@@ -142,8 +145,10 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
 
 
 def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
-    """Return the experiment's cells whose datasets have items; a study of one taxonomy has two of four. Raises
-    TrapsError if there is none."""
+    """Return the experiment's cells whose datasets have items. Raises TrapsError if there is none.
+
+    A study of one taxonomy has items of two of the four datasets.
+    """
     cells = [cell for cell in experiment.cells() if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     if not cells:
         raise TrapsError(f"{workspace.root}: no items yet; materialize scene_specs, videos and items first")
@@ -183,9 +188,11 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Whose:
-    """What a file of answers by item does not say: which model of the experiment answered (None: its only one), in
-    which run, and the key of the held-out set whose opaque names it has."""
+class AnswerContext:
+    """The context that a file of answers by item lacks.
+
+    model: of the experiment (None: its only one); run; key: of the held-out set whose opaque names the file has.
+    """
 
     model: str | None = None
     run: int = 1
@@ -196,18 +203,16 @@ def import_answers(
     workspace: Workspace,
     experiment: Experiment,
     path: Path,
-    whose: Whose | None = None,
+    context: AnswerContext | None = None,
     errors: Literal["drop", "keep"] | None = None,
-) -> Imported:
-    """Import answers (JSON lines, see `Answer`; or by item, see `exchange.harness_logs`) into the ledger; `traps run`
-    then makes tables from them.
+) -> ImportResult:
+    """Import answers into the ledger; `traps run` then builds tables from them.
 
-    All lines are checked before any is written. Raises TrapsError naming lines that are not answers, that have a key
-    outside the experiment (another question, clip, parameter or run), or that answer a key a second time differently;
-    and for a file without answers.
-
-    errors: whether texts that look like error messages are left out or are answers; TrapsError shows them where it is
-    not said.
+    path: JSON lines, see `Answer`; or answers by item, see `exchange.harness_logs`. All lines are checked before any is
+    written. Raises TrapsError naming lines that are not answers, that have a key outside the experiment (another
+    question, clip, parameter or run), or that answer a key a second time differently; and for a file without answers.
+    errors: whether texts that look like error messages are left out or are answers; if it is not given, TrapsError
+    shows them.
     """
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
@@ -217,7 +222,9 @@ def import_answers(
         return _import_batch(workspace, workspace.answers, load_models(), requested, path)
     reader = reader_of(path)
     answers, n_failed = (
-        (checked_answers(path, requested), 0) if reader is None else _by_item(reader(path), requested, whose or Whose())
+        (checked_answers(path, requested), 0)
+        if reader is None
+        else _by_item(reader(path), requested, context or AnswerContext())
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
@@ -232,11 +239,11 @@ def import_answers(
     ]
     new = asyncio.run(_store(workspace, workspace.answers, stored))
     failed = f"{n_failed} samples of the log" if n_failed else ""
-    return Imported(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
+    return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
-    """Return how many texts look like error messages, some of them, and what to do."""
+    """Return a message about texts that look like errors: their number, examples, and what to do."""
     examples = [f"{requested[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
     return (
         f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
@@ -247,8 +254,10 @@ def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mappin
 def export_request_batches(
     workspace: Workspace, experiment: Experiment, out: Path, media_at: str | None = None
 ) -> tuple[list[Path], int]:
-    """Write the experiment's missing requests as the providers' batch files (`exchange.batch.export_batches`); return
-    the files and the number of calls."""
+    """Write the experiment's missing requests as batch files; return the files and the number of calls.
+
+    See `exchange.provider_batch.export_batches`.
+    """
     prepare_media(workspace, _cells(workspace, experiment))
     missing: dict[str, list[Request]] = {}
     for request in _missing(workspace, experiment):
@@ -257,8 +266,10 @@ def export_request_batches(
 
 
 def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:
-    """Write the votes that are missing on the experiment's answers as the judges' batch files; the files, and the
-    number of calls. Raises TrapsError where answers are missing."""
+    """Write the missing votes on the experiment's answers as the judges' batch files.
+
+    Return the files, and the number of calls. Raises TrapsError if answers are missing.
+    """
     missing: dict[str, list[Request]] = {}
     known: dict[Evaluation, set[str]] = {}
     for cell, request in _wanted_votes(workspace, experiment):
@@ -270,9 +281,11 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
     return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)
 
 
-def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
-    """Import a batch of votes into their ledger; `traps run` then makes tables from them. Raises TrapsError as
-    `import_answers` does."""
+def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
+    """Import a batch of votes into their ledger; `traps run` then builds tables from them.
+
+    Raises TrapsError as `import_answers` does.
+    """
     requested = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
     return _import_batch(workspace, workspace.votes, load_judges(), requested, path)
 
@@ -287,7 +300,7 @@ def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tupl
 
 
 def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
-    outcome = replace(outcome, client=None)  # what built the call is not known: another version may have exported it
+    outcome = replace(outcome, client=None)  # the client is unknown: another version may have exported the call
     if outcome.cost_usd is None:
         return outcome
     return replace(outcome, cost_usd=outcome.cost_usd * account_of(entry).batch_price)
@@ -295,7 +308,7 @@ def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
 
 def _import_batch(
     workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], requested: Mapping[str, Request], path: Path
-) -> Imported:
+) -> ImportResult:
     returned = read_batch(path, requested)
     if not returned:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
@@ -305,12 +318,11 @@ def _import_batch(
     ]
     new = asyncio.run(_store(workspace, ledger, stored))
     failed = sum(one.outcome.kind in ("error", "malformed") for one in stored)
-    return Imported(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
+    return ImportResult(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
-    """Return the answers of a file by key. Raises TrapsError naming the lines (up to five) that are wrong or not
-    wanted."""
+    """Return the answers of a file by key. Raises TrapsError naming (up to five) wrong or unwanted lines."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):
@@ -333,15 +345,14 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
 
 
 def _by_item(
-    imported: Iterable[Given], requested: Mapping[str, Request], whose: Whose
+    imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
-    """Return the answers of a harness by key, and the number of calls that failed in it and have no answer elsewhere.
+    """Return a harness's answers by key, and the number of its failed calls without an answer elsewhere.
 
-    Epochs of a harness are runs from `whose.run` on. Raises TrapsError naming those (up to five) that are wrong or not
-    wanted.
+    Epochs of a harness are runs from `context.run` on. Raises TrapsError naming (up to five) wrong or unwanted answers.
     """
     models = sorted({request.participant for request in requested.values()})
-    model = whose.model or (models[0] if len(models) == 1 else None)
+    model = context.model or (models[0] if len(models) == 1 else None)
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
@@ -349,10 +360,10 @@ def _by_item(
         for key, request in requested.items()
         if (at := request.about)["model"] == model
     }
-    names = {opaque(whose.key, item): item for item, _, _ in keys} if whose.key else {}
+    names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
     answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
     for one in imported:
-        run = whose.run + one.epoch - 1 if one.run is None else one.run
+        run = context.run + one.epoch - 1 if one.run is None else one.run
         key = keys.get((names.get(one.item, one.item), one.regime, run))
         try:
             if key is None:
@@ -372,8 +383,10 @@ def _by_item(
 
 
 async def _store(workspace: Workspace, ledger: Ledger, stored: Sequence[_Stored]) -> int:
-    """Store what the ledger does not hold, all of it or nothing; the number of new answers. A failed call is stored,
-    too, and is asked again."""
+    """Store the outcomes that the ledger lacks, all or none; return the number of new answers.
+
+    A failed call is stored, too, and is asked again.
+    """
     rows: dict[str, list[Stored]] = {}
     for one in sorted(stored, key=lambda one: one.evaluation):
         row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)

@@ -1,7 +1,7 @@
-"""Answers by item, as other harnesses log them: inspect_ai's logs, lmms-eval's samples, and lines of one's own.
+"""Read answers by item from other harnesses' logs: inspect_ai's, lmms-eval's samples, and plain lines.
 
-They name an item and a regime, not a ledger key. Whoever imports them says which model of the experiment answered, and
-in which run. All of it is data from elsewhere: sizes are bounded, nothing is executed.
+They name an item and a regime, not a ledger key. The importing user says which model of the experiment answered, and in
+which run. All of it is untrusted data: sizes are bounded, nothing is executed.
 """
 
 from __future__ import annotations
@@ -23,19 +23,22 @@ from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
 from traps_pipeline.models.usage import Sizes, read_usage
 
 MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
-# What an ending means of an answer in a log; one that is asked again is an error.
+# Outcome by finish reason in a log; an error is asked again.
 OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
-LOG = ".eval"  # ends the name of a log of inspect_ai in its own format
-Reader = Callable[[Path], Iterator["Given"]]
+LOG = ".eval"  # suffix of inspect_ai's own log format
+Reader = Callable[[Path], Iterator["LoggedAnswer"]]
 
 
 @dataclass(frozen=True)
-class Given:
-    """An answer to an item. where: file and line or sample, for complaints. item: its id, or its opaque name in a
-    held-out set. answer: fields of `exchange.Answer` but its key. run: None where the file does not say. epoch: how
-    often the harness had asked, from 1. has_failed: the call brought no answer, so that the item stays missing."""
+class LoggedAnswer:
+    """An answer to an item from a harness's log.
+
+    where: file and line or sample, for messages. item: its id, or its opaque name in a held-out set. answer: fields of
+    `exchange.Answer` except its key. run: None if the file does not say. epoch: the harness's repetition, from 1.
+    has_failed: the call brought no answer, so that the item stays missing.
+    """
 
     where: str
     item: str
@@ -47,7 +50,7 @@ class Given:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """Return what reads a file of answers by item; None for a file of answers by key, or of a provider's batch."""
+    """Return the reader for a file of answers by item; None for answers by key, or a provider's batch."""
     if path.suffix == LOG:
         return _eval_log
     if path.suffix == ".json":
@@ -65,7 +68,7 @@ def reader_of(path: Path) -> Reader | None:
 # --- inspect_ai -------------------------------------------------------------------------------------------------------
 
 
-def _json_log(path: Path) -> Iterator[Given]:
+def _json_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
         if path.stat().st_size > MOST_LOG_BYTES:
             raise TrapsError(f"{path}: is larger than {MOST_LOG_BYTES} bytes; log it without images (--no-log-images)")
@@ -79,8 +82,8 @@ def _json_log(path: Path) -> Iterator[Given]:
         yield _sample(f"{path}: sample {number}", sample)
 
 
-def _eval_log(path: Path) -> Iterator[Given]:
-    """Yield a log is a zip with a JSON file a sample, compressed with deflate or zstd."""
+def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
+    """Yield the answers of a log in a zip, which has one JSON file per sample (deflate or zstd)."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
@@ -100,7 +103,7 @@ def _eval_log(path: Path) -> Iterator[Given]:
 
 
 def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
-    """Return an entry in zstd, which this Python's zipfile does not know. Raises ValueError."""
+    """Return an entry compressed with zstd, which this Python's zipfile does not support. Raises ValueError."""
     import pyarrow as pa
 
     raw.seek(entry.header_offset)
@@ -116,7 +119,7 @@ def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
     return content
 
 
-def _sample(where: str, sample: Any) -> Given:
+def _sample(where: str, sample: Any) -> LoggedAnswer:
     try:
         about, output = sample["metadata"], sample["output"]
         choices, epoch = output.get("choices") or [{}], sample.get("epoch", 1)
@@ -128,13 +131,13 @@ def _sample(where: str, sample: Any) -> Given:
         answer |= {"reasoning": _reasoning(choices[0].get("message")), **_tokens(output.get("usage") or {})}
         if type(epoch) is not int:
             raise TypeError("its epoch is no whole number")
-        return Given(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
+        return LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise TrapsError(f"{where}: is no sample of this benchmark's task ({plain(repr(error))[:200]})") from error
 
 
 def _reasoning(message: Any) -> str | None:
-    """Return what stands in the parts of a message that are reasoning."""
+    """Return the text of a message's reasoning parts."""
     content = message.get("content") if isinstance(message, dict) else None
     parts = [part for part in content if isinstance(part, dict)] if isinstance(content, list) else []
     texts = [part.get("reasoning") for part in parts if part.get("type") == "reasoning" and not part.get("redacted")]
@@ -142,7 +145,7 @@ def _reasoning(message: Any) -> str | None:
 
 
 def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
-    """Return the tokens of a call, None where they are unknown.
+    """Return the tokens of a call, None if they are unknown.
 
     inspect_ai's providers count cached input and reasoning within `input_tokens` and `output_tokens` or beside them;
     the total tells which.
@@ -169,7 +172,7 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
 # --- lmms-eval and lines of one's own ---------------------------------------------------------------------------------
 
 
-def _lmms_samples(path: Path) -> Iterator[Given]:
+def _lmms_samples(path: Path) -> Iterator[LoggedAnswer]:
     for number, line in read_lines(path):
         where = f"{path}:{number}"
         try:
@@ -177,13 +180,13 @@ def _lmms_samples(path: Path) -> Iterator[Given]:
             about, texts = row["traps_pecs"], row["filtered_resps"]
             while isinstance(texts, list):
                 (texts,) = texts
-            yield Given(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
+            yield LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
         except (ValueError, KeyError, TypeError) as error:
             raise TrapsError(f"{where}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})") from error
 
 
-def _own_lines(path: Path) -> Iterator[Given]:
-    """Yield lines with item, regime, text, and run where there are several."""
+def _own_lines(path: Path) -> Iterator[LoggedAnswer]:
+    """Yield lines with item, regime, text, and run if there are several."""
     for number, line in read_lines(path):
         try:
             row = json.loads(line)
@@ -191,13 +194,13 @@ def _own_lines(path: Path) -> Iterator[Given]:
             if run is not None and type(run) is not int:
                 raise ValueError("run is no whole number")
             answer = _answer(row.pop("outcome", "answer"), row.pop("text", None)) | row
-            yield Given(f"{path}:{number}", str(item), str(regime), run, answer)
+            yield LoggedAnswer(f"{path}:{number}", str(item), str(regime), run, answer)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrapsError(f"{path}:{number}: gives no item, regime and text ({plain(repr(error))[:200]})") from error
 
 
 def _answer(outcome: str, text: str | None) -> dict[str, Any]:
-    """Return outcome and text as the ledger has them: no text without an outcome that has one."""
+    """Return outcome and text in the ledger's form: a text only with an outcome that has one."""
     if outcome in (*WITH_TEXT, UNFINISHED) and not (text or "").strip():
         outcome = "empty"
     return {"outcome": outcome, "text": text if outcome in (*WITH_TEXT, UNFINISHED) else None}

@@ -1,7 +1,7 @@
-"""Media of a batch by reference: a body names an address, and the file lies beside the batch, to be published there.
+"""Replace a batch's inline media by references to files beside the batch, to be published there.
 
-A batch file with its clips inline takes 300 KB a call; with references a call takes 2 KB, and a clip is stored once for
-all regimes and runs. Which addresses a provider reads is for it to say: OpenAI and Anthropic take https for images,
+A batch file with its clips inline takes 300 KB per call; with references a call takes 2 KB, and a clip is stored once
+for all regimes and runs. Providers differ in the addresses that they read: OpenAI and Anthropic take https for images,
 Gemini the URI of its File API or of Cloud Storage, vLLM https, and file:// below `--allowed-local-media-path`.
 """
 
@@ -22,8 +22,8 @@ _DATA, _BASE64 = "data:", ";base64,"
 
 
 @dataclass(frozen=True)
-class References:
-    """Where media are written, and the address under which that folder's files will be found."""
+class MediaReferences:
+    """The folder that media are written to, and its future public address."""
 
     folder: Path
     address: str
@@ -38,8 +38,10 @@ class References:
         return f"{self.address.rstrip('/')}/{name}"
 
     def instead_of(self, value: Any) -> Any:
-        """Return a body with an address for each inline medium, in the form of its API: OpenAI's data URIs, Gemini's
-        inline data, and Anthropic's sources. Everything else stays as it is."""
+        """Return a body with an address for each inline medium, in the form of its API.
+
+        These are OpenAI's data URIs, Gemini's inline data, and Anthropic's sources. Everything else is unchanged.
+        """
         match value:
             case str() if value.startswith(_DATA) and _BASE64 in value[:64]:
                 kind, _, data = value.removeprefix(_DATA).partition(_BASE64)

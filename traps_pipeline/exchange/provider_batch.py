@@ -1,8 +1,8 @@
-"""Calls as the providers' own batch files, and the answers that come back in theirs (docs/models.md, "Batches").
+"""Export calls as providers' batch files, and import their answers (docs/models.md, "Batches").
 
-A body is written as the live call would send it: the entry's backend sends it to this machine, where it is recorded. An
-answer is read as the live call would read it: the backend gets it from this machine, with the status that the provider
-gave it. So both ways make the same rows.
+A body is exactly the live call's: the entry's backend sends it to this machine, where it is recorded. An answer is read
+exactly like the live call's: the backend gets it from this machine, with the provider's status. So both ways produce
+the same rows.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.checks.loopback import render, replay
 from traps_pipeline.checks.wire_body import Api, WireBody
 from traps_pipeline.exchange.media_references import FOLDER as MEDIA
-from traps_pipeline.exchange.media_references import References
+from traps_pipeline.exchange.media_references import MediaReferences
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Outcome, Request
 
 FOLDER = "batches"
-AT_ONCE = 200  # bodies in memory
-# The most calls and bytes of a file, as the providers publish them; vLLM's run-batch reads OpenAI's form.
+AT_ONCE = 200  # maximum bodies in memory
+# Providers' published limits of calls and bytes per file; vLLM's run-batch reads OpenAI's form.
 LIMITS: Mapping[Api, tuple[int, int]] = {
     "chat": (50_000, 190 * 2**20),
     "responses": (50_000, 190 * 2**20),
@@ -36,7 +36,7 @@ LIMITS: Mapping[Api, tuple[int, int]] = {
     "anthropic": (100_000, 240 * 2**20),
 }
 SHOWN = 5
-FAILED = 400  # statuses from here on are failures
+FAILED = 400  # lowest status of a failure
 
 
 Item = TypeVar("Item")
@@ -55,10 +55,12 @@ def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
 def export_batches(
     calls: Mapping[str, tuple[Entry, Iterable[Request]]], out: Path, media_at: str | None = None
 ) -> tuple[list[Path], int]:
-    """Write the calls of each participant to files below `out`, split where the provider's limits want it; the files
-    and the number of calls. media_at: the address under which the folder `media` of `out` will be found, to which the
-    bodies then refer; without it media are inline. Raises TrapsError where a call cannot be made, or where files are
-    there already."""
+    """Write the calls of each participant to files below `out`, split at the provider's limits.
+
+    Return the files and the number of calls. media_at: the future address of the folder `media` of `out`, which the
+    bodies then refer to; without it media are inline. Raises TrapsError if a call cannot be built, or if files exist
+    already.
+    """
     if here := [name for name, (entry, _) in calls.items() if entry.account is None]:
         raise TrapsError(
             f"{', '.join(here[:5])}{' and others are' if len(here) > 5 else ' are' if len(here) > 1 else ' is'} asked "
@@ -69,7 +71,7 @@ def export_batches(
         raise TrapsError(f"{folder} holds batches already; give another folder, or delete it")
     folder.mkdir(parents=True, exist_ok=True)
     files, count = list[Path](), 0
-    references = References(out / MEDIA, media_at) if media_at else None
+    references = MediaReferences(out / MEDIA, media_at) if media_at else None
     for name, (entry, requests) in calls.items():
         part = _Part(folder, name)
         for some in _some(requests):
@@ -142,8 +144,8 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class Returned:
-    """What a provider returned for a call: a status and a body, or in a word why there is none."""
+class BatchResult:
+    """A provider's result of a call: a status and a body, or the reason for their absence in one word."""
 
     status: int = 0
     body: bytes = b""
@@ -151,7 +153,7 @@ class Returned:
 
 
 def is_batch(path: Path) -> bool:
-    """Return whether a file is a provider's, and not one of answers in this project's form."""
+    """Return whether a file is a provider's batch, not answers in this project's form."""
     for _, line in read_lines(path):
         try:
             parsed = json.loads(line)
@@ -161,10 +163,12 @@ def is_batch(path: Path) -> bool:
     return False
 
 
-def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]:
-    """Return what a file of OpenAI's, vLLM's, Gemini's or Anthropic's form returns, by key. Raises TrapsError naming
-    lines that are no answers, and keys that are not wanted or stand there twice."""
-    answers, wrong = dict[str, Returned](), list[str]()
+def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResult]:
+    """Return the results in a file of OpenAI's, vLLM's, Gemini's or Anthropic's form, by key.
+
+    Raises TrapsError naming lines that are no results, and unwanted or repeated keys.
+    """
+    answers, wrong = dict[str, BatchResult](), list[str]()
     for number, line in read_lines(path):
         try:
             key, returned = _returned(json.loads(line))
@@ -183,33 +187,33 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, Returned]
     return answers
 
 
-def _returned(line: Any) -> tuple[str, Returned]:
+def _returned(line: Any) -> tuple[str, BatchResult]:
     if "result" in line:  # Anthropic
         result = line["result"]
         if result["type"] == "succeeded":
-            return line["custom_id"], Returned(200, json.dumps(result["message"]).encode())
-        return line["custom_id"], Returned(error=_word(result["type"]))
+            return line["custom_id"], BatchResult(200, json.dumps(result["message"]).encode())
+        return line["custom_id"], BatchResult(error=_word(result["type"]))
     key = line["custom_id"] if "custom_id" in line else line["key"]
     error, response = line.get("error"), line.get("response")
     status = int((response or {}).get("status_code") or 0)
     if error and status >= FAILED:  # vLLM: a status without a body, and beside it what it would have been
-        return key, Returned(status, json.dumps({"error": error.get("error") or error}).encode())
+        return key, BatchResult(status, json.dumps({"error": error.get("error") or error}).encode())
     if error:
-        return key, Returned(error=_word(error.get("code") or error.get("status") or "error"))
+        return key, BatchResult(error=_word(error.get("code") or error.get("status") or "error"))
     if "custom_id" in line:  # OpenAI, vLLM
-        return key, Returned(status, json.dumps(response["body"]).encode())
-    return key, Returned(200, json.dumps(response).encode())  # Gemini
+        return key, BatchResult(status, json.dumps(response["body"]).encode())
+    return key, BatchResult(200, json.dumps(response).encode())  # Gemini
 
 
 def _word(value: Any) -> str:
-    """Return the kind of a failure of a batch, which the provider names."""
+    """Return the kind of a batch failure, as the provider names it."""
     return "batch_" + "".join(c for c in str(value).lower() if c.isalnum() or c == "_").removeprefix("batch_")[:40]
 
 
 def outcomes_of(
-    entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, Returned]
+    entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, BatchResult]
 ) -> Iterator[tuple[Request, Outcome]]:
-    """Yield each returned call with its outcome, as the live call would have read it."""
+    """Yield each returned call with its outcome, read like a live call's."""
     by_name: dict[str, list[str]] = {}
     for key in returned:
         by_name.setdefault(wanted[key].participant, []).append(key)

@@ -1,1 +1,1 @@
-"""The panel of judges: what it is shown, and how its votes become verdicts (docs/spec.md 4)."""
+"""The panel of judges: what judges are asked, and how their votes become verdicts (docs/spec.md 4)."""

@@ -1,7 +1,7 @@
-"""Agreement of the judges, and the bias of each (docs/spec.md 4.4).
+"""Agreement between judges, and the bias of each (docs/spec.md 4.4).
 
-Everything is counted per dataset and task over all models, regimes and runs. A coefficient that is undefined is null,
-and the reason is given: if all votes are of one class, agreement beyond chance is undefined.
+Everything is counted per dataset and task over all models, regimes and runs. An undefined coefficient is null, with the
+reason: if all votes are of one class, agreement beyond chance is undefined.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Rati
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return AGREEMENT rows from VOTES rows: per dataset and task, one for the panel and one for every two of its
-    judges."""
+    """Return AGREEMENT rows from VOTES rows: per dataset and task, one for the panel and one per pair of its judges."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         rows.append(about | _panel_row(group.values))
@@ -31,8 +30,10 @@ def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.Da
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return JUDGE_BIAS rows from VOTES rows: each judge's rate of yes against that of the majority on the same
-    answers."""
+    """Return JUDGE_BIAS rows from VOTES rows.
+
+    They compare each judge's rate of yes with that of the majority on the same answers.
+    """
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         verdict = majority(group.values)
@@ -69,10 +70,10 @@ def complete(values: np.ndarray) -> np.ndarray:
 
 
 def fleiss_kappa(values: np.ndarray) -> float:
-    """Return Fleiss' kappa of complete rows, (answers, judges) of YES and NO; NaN where there is one class or no row.
+    """Return Fleiss' kappa of complete rows, (answers, judges) of YES and NO.
 
     An answer with y yes of k votes agrees by (y (y-1) + (k-y) (k-y-1)) / (k (k-1)); chance by p^2 + (1-p)^2, p being
-    the share of yes in all votes. NaN also for a single judge.
+    the share of yes in all votes. NaN if there is one class or no row, and for a single judge.
     """
     n, k = values.shape
     yes = (values == YES).sum(axis=1)
@@ -84,8 +85,9 @@ def fleiss_kappa(values: np.ndarray) -> float:
 
 
 def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
-    """Return Cohen's kappa of two judges' votes of YES and NO on the same answers; NaN where there is one class or no
-    vote."""
+    """Return Cohen's kappa of two judges' votes of YES and NO on the same answers; NaN if there is one class or no
+    vote.
+    """
     yes = int((one == YES).sum()), int((other == YES).sum())
     n = len(one)
     if sum(yes) in (0, 2 * n):
@@ -95,11 +97,11 @@ def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def krippendorff_alpha(values: np.ndarray) -> float:
-    """Return Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing. NaN where the answers that
-    have two valid votes or more hold one class or none.
+    """Return Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing.
 
     In an answer with y yes of m valid votes, 2 y (m-y) of its m (m-1) ordered pairs disagree, with weight 1 / (m-1)
-    each; by chance, 2 n_yes n_no of the n (n-1) ordered pairs of all n pairable votes would disagree.
+    each; by chance, 2 n_yes n_no of the n (n-1) ordered pairs of all n pairable votes would disagree. NaN if the
+    answers with two valid votes or more hold one class or none.
     """
     yes, valid = (values == YES).sum(axis=1), (values != INVALID).sum(axis=1)
     pairable = valid > 1
@@ -112,8 +114,7 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 
 def unanimous_share(values: np.ndarray) -> float:
-    """Return share of complete rows, (answers, judges), on which all votes are the same; NaN where there is no row, or
-    a single judge."""
+    """Return the share of complete rows, (answers, judges), with unanimous votes; NaN without rows or for one judge."""
     several = len(values) and values.shape[1] > 1
     return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
 

@@ -1,9 +1,9 @@
-"""Labels of confabulation: the errors in answers that should have been abstentions (docs/spec.md 6.1 and 6.2).
+"""Label confabulation: the errors in answers that should have been abstentions (docs/spec.md 6.1 and 6.2).
 
 A seeded sample of each model's void failures goes to one judge, which labels four independent axes
 (`scoring.prevalence` counts them). `assets/confabulation.yaml` names the models, the size of a sample and the judge. A
 sample consists of the n failures with the smallest digests. It is uniform and independent between models, and a failure
-that appears or disappears changes at most one member, so that nearly all labels already paid for are used again.
+that appears or disappears changes at most one member, so that nearly all paid labels are reused.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
-from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quote
 from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.ask import Call, Settled
+from traps_pipeline.models.ask import Call, SettledCell
 from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.schemas import structured
+from traps_pipeline.models.schemas import structured_output
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.ratings import AXES
@@ -42,10 +42,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
 TASK = "confabulation"
-# The parts of a failure's id, to which people's labels refer: another answer is another failure. They are in the
-# protocol's digest, so that the table is made again when the parts change.
+# The parts of a failure's id, which people's labels refer to: another answer is another failure. They are in the
+# protocol's digest, so that the table is rebuilt when the parts change.
 SAMPLED = ("cell", "item", "answer", "trace that the judge sees")
-SCHEMA = structured(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
+SCHEMA = structured_output(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
 TRACE_AND_OUTPUT, OUTPUT = "trace_and_output", "output"
 Evidence = Literal["trace_and_output", "output"]
 VOID_KINDS: Mapping[str, str] = {
@@ -65,7 +65,7 @@ class Validation(BaseModel):
 
 
 class Protocol(BaseModel):
-    """`assets/confabulation.yaml`: the sample of each model, the judge of each panel, and what the judge is shown."""
+    """The contents of `assets/confabulation.yaml`: each model's sample, each panel's judge, and the judge's prompt."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     n: int = Field(ge=1, description="failures per model; all if there are fewer")
@@ -77,18 +77,18 @@ class Protocol(BaseModel):
     validation: Validation
 
     def cells(self, model: str) -> list[Cell]:
-        """Return the cells that a model's failures come from."""
+        """Return the cells from which a model's failures are drawn."""
         return [Cell(dataset, Evaluation(model, self.regime, self.run)) for dataset in DATASETS]
 
     def judge(self, panel: str) -> JudgeEntry | None:
-        """Return the judge of a study with this panel; None where there is none."""
+        """Return the judge of a study with this panel; None if there is none."""
         name = self.judges.get(panel)
         return load_judges()[name] if name is not None else None
 
 
 @cache
 def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
-    """Return the protocol. Raises TrapsError naming the file and the field, model or judge that is wrong."""
+    """Return the protocol. Raises TrapsError naming the file and the wrong field, model or judge."""
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
     with within(path):
         runs = {model: get_model(model).runs for model in protocol.models}
@@ -107,7 +107,7 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
 
 
 def protocol_digest(panel: str) -> str:
-    """Return the digest of everything, besides the answers, that the labels of a study with this panel depend on."""
+    """Return the digest of everything, except the answers, that the labels of a study with this panel depend on."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
@@ -120,7 +120,7 @@ def protocol_digest(panel: str) -> str:
 
 @dataclass(frozen=True)
 class Failure(Call):
-    """The call to the judge about a sampled void failure; n_failures is the number of failures sampled from."""
+    """The call to the judge about a sampled void failure; n_failures is the size of the population."""
 
     item: Mapping[str, Any]
     text: str
@@ -135,21 +135,18 @@ def void_kind(dataset: str) -> str:
     return "occluder" if dataset == "occlusion" else "truncation"
 
 
-def drawn(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return a seeded sample of n keys without replacement (all keys if there are fewer), independent of their
-    order.
-    """
+def draw_sample(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return a seeded sample of n keys without replacement (all keys if there are fewer), independent of order."""
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
 
 
 def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -> str:
-    """Return the id of a failure for its annotators: it reveals neither model nor item, and changes with the answer."""
+    """Return a failure's id for annotators: it reveals neither model nor item, and changes with the answer."""
     return digest([cell.key, item_id, answer, trace or None])[:12]
 
 
 def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
-    """Return a model's sample by cell. Empty, with a note, until every dataset of the study that has items has
-    verdicts."""
+    """Return a model's sample by cell; empty, with a note, while a dataset with items lacks verdicts."""
     protocol = load_protocol()
     cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     lacking = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
@@ -159,7 +156,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
         return {}
     failures = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
     sample: dict[Cell, list[Failure]] = {}
-    for key in drawn(protocol.seed, protocol.n, failures):
+    for key in draw_sample(protocol.seed, protocol.n, failures):
         cell, row = failures[key]
         trace = row["reasoning"] if protocol.models[model] == TRACE_AND_OUTPUT else None
         request = label_request(judge, cell, row, row["text"], trace)
@@ -168,7 +165,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
 
 
 def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
-    """Return the void items whose answers the panel judged as not abstained, with text and trace of each answer."""
+    """Return the void items whose answers do not abstain by the panel's verdict, with text and trace of each answer."""
     verdicts = workspace.tables.read(VERDICTS, cell.partition, ["item_id", "side", "abstained"])
     failed = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].eq(False), ["item_id"]]
     responses = workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"])
@@ -184,9 +181,9 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
     """Return the user message to the judge."""
-    parts = [quoted("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
+    parts = [quote("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
     about = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
-    return "\n\n".join([*about, *parts, quoted("response", "RESPONSE", answer)])
+    return "\n\n".join([*about, *parts, quote("response", "RESPONSE", answer)])
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
@@ -196,7 +193,7 @@ def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer
 
 
 class Labels(BaseModel):
-    """Schema of the task (`prompts/judge_confabulation.txt`)."""
+    """The schema of the task (`prompts/judge_confabulation.txt`)."""
 
     model_config = ConfigDict(extra="ignore")
     hallucinated_premise: Flag
@@ -210,10 +207,10 @@ class Labels(BaseModel):
 
 
 def collect_labels(workspace: Workspace) -> StageOutput:
-    """Return CONFABULATION rows of a study: sample every model of the protocol whose answers are judged, and ask the
-    judge for the labels that the ledger of votes does not hold.
+    """Return CONFABULATION rows of a study.
 
-    There are no rows if the study's panel has no judge for confabulation.
+    Sample every judged model of the protocol, and ask the judge for the labels that the ledger of votes lacks. There
+    are no rows if the study's panel has no judge for confabulation.
     """
     protocol, table, total = load_protocol(), list[ConfabulationRow](), Tally()
     judge = protocol.judge(workspace.study.panel)
@@ -223,8 +220,8 @@ def collect_labels(workspace: Workspace) -> StageOutput:
     for model in protocol.models:
         samples |= sample_failures(workspace, judge, model)
 
-    def finish(settled: Settled[Cell, Failure]) -> tuple[Cell, StageOutput]:
-        return settled.made(_label_row)
+    def finish(settled: SettledCell[Cell, Failure]) -> tuple[Cell, StageOutput]:
+        return settled.output(_label_row)
 
     for _, output in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
         table.extend(output.rows(CONFABULATION))

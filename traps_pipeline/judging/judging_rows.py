@@ -159,7 +159,7 @@ class ConfabulationRow(shared.CellRow):
 CONFABULATION = Table("confabulation", ConfabulationRow, partition_by=(), key=("model", "item_id"))
 
 
-# A command makes this table from a file that people wrote, so it is no stage; `traps people validate` writes it.
+# `traps people validate` writes this table from people's file, so no stage declares it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeValidationRow:
     """The confabulation judge against two blind annotators on one axis, or pooled over the four."""
@@ -191,7 +191,7 @@ class JudgeValidationRow:
 JUDGE_VALIDATION = Table("judge_validation", JudgeValidationRow, partition_by=(), key=("axis",))
 
 
-# A command makes this table, so it is no stage; `traps models test-panel` writes it.
+# `traps models test-panel` writes this table, so no stage declares it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeRobustnessRow:
     """One judge's vote on one task about an answer that tries to instruct it (assets/injected_answers.yaml)."""

@@ -1,4 +1,4 @@
-"""The rule judge, which reads the texts of reference models exactly and leaves any other text unread.
+"""The rule judge: read the texts of reference models exactly, and leave any other text unread.
 
 Like any judge it reads the rendered user message and answers with the JSON that the prompts ask for, or with the word
 `unread`. It never guesses; docs/judging.md, "The rule judge" lists the forms that it reads.
@@ -16,8 +16,8 @@ from traps_pipeline.models.judged_answers import NUMBER_WORDS, UNREAD, normalise
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.models.thinking import strip_fence
 
-# Answers that commit under any question: labels of the pairs, of questions that both sides answer, and what else the
-# pocket model guesses.
+# Answers that commit under any question: labels of pairs and of answerable questions, and other guesses of the
+# pocket model.
 _LABEL = re.compile(
     r"left|right|elsewhere|somewhere else|balanced|level|yes|no|[-+]?\d+(?:\.\d+)?|\d+-\d+|red|green|blue|yellow|"
     "orange|cyan|purple|white|black|grey|gray|brown|pink|magenta|teal|turquoise|violet"
@@ -54,8 +54,10 @@ _QUESTION = re.compile(r"\AQuestion: (.*)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Statement:
-    """What a text states. value: the answer that it commits to; None where it abstains. rejects: whether it says that
-    something is not there that the question takes for granted."""
+    """The meaning of a text. value: the answer that it commits to; None if it abstains.
+
+    rejects: whether it denies that something in the question exists.
+    """
 
     value: str | None
     rejects: bool = False
@@ -65,7 +67,7 @@ ABSTENTION = Statement(None)
 
 
 class RuleJudge:
-    """The backend of a rule judge, for any seat of the panel (see `Backend`)."""
+    """The backend of a rule judge, for any judge of the panel (see `Backend`)."""
 
     async def ask(self, request: Request) -> Outcome:
         """Return the vote as JSON text, or the word UNREAD."""
@@ -80,7 +82,7 @@ class RuleJudge:
 
 
 def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
-    """Return the vote on correctness where the judge is told a ground truth, else the vote on abstention."""
+    """Return the vote on correctness if the judge gets a ground truth, else the vote on abstention."""
     value = statement.value
     declines = "The response rejects the premise." if statement.rejects else "The response declines."
     reason = declines if value is None else f"The response answers {value!r}."
@@ -92,7 +94,7 @@ def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
 
 
 def read_statement(text: str, question: str = "") -> Statement | None:
-    """Return what an answer states; None if it is unread: it has none of the known forms, or contradicts itself."""
+    """Return the meaning of an answer; None if it has none of the known forms, or contradicts itself."""
     answer = read_object(text)
     return _in_text(strip_fence(text), question) if answer is None else _in_object(answer, question)
 
@@ -114,8 +116,8 @@ def _in_object(answer: Mapping[str, Any], question: str) -> Statement | None:
 def _in_text(text: str, question: str) -> Statement | None:
     """Read a text that is a statement, ends with one, or begins with one that its second sentence explains.
 
-    No other sentence may announce another answer, and before a sentence that declines none of the question's choices
-    may stand.
+    No other sentence may announce another answer, and no choice of the question may stand before a sentence that
+    declines.
     """
     sentences = [part for part in _SENTENCE_END.split(_MARKUP.sub("", text).strip()) if part]
     wording, last = f" {_words(question)} ", len(sentences) - 1
@@ -136,7 +138,7 @@ def _in_text(text: str, question: str) -> Statement | None:
 
 
 def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement | None:
-    """Read words that are an abstention or a choice, and no more. any_label: whatever does not decline is a choice."""
+    """Read words that are exactly an abstention or a choice. any_label: anything that does not decline is a choice."""
     words = _words(text)
     if not words or _STRANGE.search(text):
         return None
@@ -149,7 +151,7 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
 
 
 def _offers(question: str, words: str) -> bool:
-    """Return whether a question names words as one of its choices: they end one part of its list, and no other part."""
+    """Return whether a question offers these words as a choice: they end exactly one part of its list."""
     texts = (question, re.sub(r"\s*\([^)]*\)", "", question)) if " or " in question and words.count(" ") < 5 else ()
     lists = [_words(re.sub(r"[,:;?]| -- ", " or ", text)) for text in texts]
     return any(len(re.findall(rf"\b{re.escape(words)} or\b", parts)) == 1 for parts in lists)

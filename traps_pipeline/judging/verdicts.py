@@ -1,4 +1,4 @@
-"""Verdicts: the decision of the panel's majority on every answer (docs/spec.md 4.1)."""
+"""Verdicts: the majority decision of the panel on every answer (docs/spec.md 4.1)."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
-    """Return VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError where these do not fit."""
+    """Return VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError if these do not match."""
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
     votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"])
-    # Where no answer of the cell is judged, no vote names a panel: what decides nothing is of the study's.
+    # If no answer of the cell is judged, no vote names a panel, so the rows name the study's.
     return decide(items, responses, votes).fillna({"panel": panel_id(workspace.study.panel)})
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named
-    above. The panel is that of the cell's votes, null where it has none. The outcome is the response's, or UNREAD where
-    that is the vote of every judge.
+    """Return VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows.
+
+    The rows need the columns named above. The panel is that of the cell's votes, null if it has none. The outcome is
+    the response's, or UNREAD if that is the vote of every judge.
 
     A response without a text is not judged, so its decisions are null. Two valid votes that agree decide; 1-1 with an
     invalid vote, or fewer valid votes, is undecided. Raises TrapsError for a response to an item that is no longer in
@@ -75,8 +76,10 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
 
 
 def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> pd.arrays.BooleanArray:
-    """Return the majority on whether each answer rejects the premise, (rows,); null without one, or where nobody was
-    asked."""
+    """Return the majority on whether each answer rejects the premise, (rows,).
+
+    Null without a majority, or if no judge was asked.
+    """
     marks = votes.loc[votes["task"].eq("abstention") & votes["rejects_premise"].notna(), [*ANSWER, "rejects_premise"]]
     yes = marks.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
     counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)

@@ -1,1 +1,1 @@
-"""What was paid for: answers, votes and money, in one SQL database of a study."""
+"""The ledger of paid calls: answers, votes and money, in one SQL database per study."""

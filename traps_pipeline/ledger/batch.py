@@ -1,4 +1,4 @@
-"""One transaction of the ledger: rows, what they add up to, and the money that moves with them."""
+"""One transaction of the ledger: rows, their totals, and the money that moves with them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CENT = 1e-9  # below this, dollars are rounding
 
 @dataclass
 class Batch:
-    """One transaction of the thread that commits, and the changes of rows and money that are written at its end."""
+    """A transaction of the commit thread. Changes of rows and money are collected and written at its end."""
 
     connection: sa.Connection
     study: int
@@ -44,7 +44,7 @@ class Batch:
 
     @cached_property
     def reserved(self) -> dict[str, float]:
-        """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
+        """Dollars of reservations, by participant; callers that add or remove reservations keep it up to date."""
         query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
         reserved = dict[str, float]()
         for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
@@ -54,7 +54,7 @@ class Batch:
         return reserved
 
     def spend(self, participant: str, usd: float) -> None:
-        """Count dollars as spent, or as spent no more."""
+        """Count dollars as spent; a negative amount is taken back."""
         self.more_usd[participant] = self.more_usd.get(participant, 0.0) + usd
         if "spent" in self.__dict__:
             self.spent[participant] = self.spent.get(participant, 0.0) + usd
@@ -66,7 +66,7 @@ class Batch:
         self.reserved[participant] = self.reserved.get(participant, 0.0) + usd
 
     def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> None:
-        """Put dollars into the place of a reservation's; none: remove it."""
+        """Replace a reservation's amount; an amount of 0 removes the reservation."""
         its = RESERVATIONS.c.id == reservation
         if usd > CENT:
             self.connection.execute(sa.update(RESERVATIONS).where(its).values(usd=usd))
@@ -77,21 +77,21 @@ class Batch:
             self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
 
     def cover(self, participant: str, reservations: Sequence[str]) -> None:
-        """Remove the reservations of a call whose cost stands in its row now."""
+        """Remove the reservations of a call whose row now records its cost."""
         self.covered |= dict.fromkeys(reservations)
         if "reserved" in self.__dict__:
             was_usd = sum(self._open.pop(reservation, 0.0) for reservation in reservations)
             self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
 
     def is_writer(self, evaluation: int) -> bool:
-        """Return whether this session may add rows to an evaluation: another one may have taken its lock over."""
+        """Return whether this session may add rows to an evaluation: another one may have taken over its lock."""
         if evaluation not in self._writers:
             query = sa.select(EVALUATIONS.c.writer).where(EVALUATIONS.c.id == evaluation)
             self._writers[evaluation] = self.connection.execute(query).scalar() == self.session
         return self._writers[evaluation]
 
     def flush(self) -> None:
-        """Write what was collected."""
+        """Write the collected changes."""
         if self.rows:
             self.connection.execute(sa.insert(ROWS), self.rows)
         if self.reservations:
@@ -118,8 +118,10 @@ class Batch:
 
 
 def _adding(table: sa.Table, *columns: str) -> sa.Update:
-    """Return a statement that adds `more_COLUMN` to columns of the row whose key is given by `of_COLUMN`. It is made
-    once: SQLAlchemy takes longer to make such a statement than SQLite to execute it."""
+    """Return a statement that adds `more_COLUMN` to columns of the row with the key `of_COLUMN`.
+
+    It is cached: SQLAlchemy takes longer to build such a statement than SQLite to execute it.
+    """
     key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
     more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
     return sa.update(table).where(*key).values(more)
@@ -133,12 +135,12 @@ _ADD_TOTALS = _adding(
 
 
 def holder() -> str:
-    """Return this process and the time, for those who wait for it."""
+    """Return this process and the time, as shown to processes that wait for it."""
     return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')}"
 
 
 def claim(batch: Batch, kind: str, name: str) -> int:
-    """Make this session the writer of an evaluation, whose lock it holds; the evaluation's number."""
+    """Make this session the writer of an evaluation whose lock it holds; return the evaluation's number."""
     mine = {"study": batch.study, "kind": kind, "name": name}
     here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in mine.items()))
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}

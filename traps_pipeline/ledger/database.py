@@ -1,8 +1,8 @@
-"""The database of a study's ledger: transactions, named locks, and a thread in which calls share commits.
+"""The database of a study's ledger: transactions, named locks, and a thread that groups commits.
 
-Hundreds of calls are in flight at once, and each changes the database twice: before it is sent and when it is
-answered. So changes are put into a queue, and one thread applies all that wait there in one transaction. A change is
-done when its future is. What differs between SQLite and PostgreSQL is in the two modules beside this one.
+Hundreds of calls are in flight at once, and each changes the database twice: before it is sent and when it is answered.
+So changes are queued, and one thread applies all waiting ones in one transaction. A change is done when its future is.
+The two modules beside this one hold the differences between SQLite and PostgreSQL.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from traps_pipeline.ledger.schema import (
 )
 
 T = TypeVar("T")
-BEAT_S = 0.5  # how often a process that holds something says so
-MOST_CHANGES = 1000  # of one transaction
-SHARE_S, SHARER_S = 2.0, 10.0  # how often a process says that it asks through an account, and how long that holds
+BEAT_S = 0.5  # how often a process renews its locks and reservations
+MOST_CHANGES = 1000  # per transaction
+SHARE_S, SHARER_S = 2.0, 10.0  # how often a process announces that it uses an account, and how long that is valid
 
 
 Change = Callable[[Batch], Any]
@@ -41,8 +41,10 @@ Change = Callable[[Batch], Any]
 
 @dataclass(frozen=True)
 class Lock:
-    """A named lock of this process. require(): raises TrapsError when it is not this process's any more. is_fresh():
-    whether that can be told at once, without asking a server, which may be away."""
+    """A named lock of this process. require(): raises TrapsError once the lock is lost.
+
+    is_fresh(): whether that is known at once, without asking a server, which may be unreachable.
+    """
 
     release: Callable[[], None]
     require: Callable[[], None]
@@ -50,28 +52,28 @@ class Lock:
 
 
 class Database(ABC):
-    """The ledger's database of one study, as this process uses it. Its methods may be called from any thread."""
+    """The ledger's database of one study, as this process uses it. Its methods are thread-safe."""
 
     def __init__(self, study: str) -> None:
         self.study_name = study
-        self.session = ""  # while this process writes: a name for that, which none had before
+        self.session = ""  # while this process writes: a unique id
         self.study = 0  # the study's number, once there is one
         self._queue: SimpleQueue[tuple[Change, Future[Any]] | None] = SimpleQueue()
         self._users, self._guard, self._batch = 0, threading.Lock(), 0
         self._thread: threading.Thread | None = None
         self._session_lock: Lock | None = None
-        self.sharers: dict[str, int] = {}  # by account that is asked through: how many processes do so now
+        self.sharers: dict[str, int] = {}  # by account in use: the number of processes that use it now
 
     # --- what differs between databases -------------------------------------------------------------------------------
 
     @property
     @abstractmethod
     def place(self) -> str:
-        """Where the ledger is, for people; no password is in it."""
+        """The ledger's location for people, without a password."""
 
     @abstractmethod
     def exists(self) -> bool:
-        """Return whether there may be something to read."""
+        """Return whether the database may exist."""
 
     @abstractmethod
     def read(self) -> sa.Connection:
@@ -79,38 +81,40 @@ class Database(ABC):
 
     @abstractmethod
     def run(self, work: Callable[[sa.Connection], T]) -> T:
-        """Return what `work` returns, done in one transaction that writes; where a connection breaks it is done again.
-        Raises TrapsError."""
+        """Run `work` in one write transaction and return its result; repeat it if the connection breaks.
+
+        Raises TrapsError.
+        """
 
     @abstractmethod
     def try_lock(self, name: str) -> Lock | None:
-        """Take a named lock until this process ends; None while another session has it. Raises TrapsError."""
+        """Take a named lock until this process ends; return None if another session holds it. Raises TrapsError."""
 
     def now_s(self, connection: sa.Connection) -> float:
-        """Return the seconds since 1970 of a clock that all processes of the study share."""
+        """Return seconds since 1970, by a clock that all processes of the study share."""
         return time.time()
 
     @abstractmethod
     def sync(self) -> None:
-        """Return when not even a power cut loses what was committed. Raises TrapsError."""
+        """Sync to disk everything that was committed. Raises TrapsError."""
 
     def faults(self) -> Iterator[str]:
-        """Yield sentences on what is wrong with the database itself, where it can look. Raises TrapsError."""
+        """Yield sentences about faults of the database itself, if it can check. Raises TrapsError."""
         yield from ()
 
     @abstractmethod
     def beat(self) -> None:
-        """Do what keeps locks this process's, where they are lost otherwise. Raises TrapsError."""
+        """Renew this process's locks if they could expire. Raises TrapsError."""
 
     @abstractmethod
     def end(self) -> None:
-        """Close what writing needed."""
+        """Close the resources that writing needed."""
 
     # --- writing ------------------------------------------------------------------------------------------------------
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Let this process write within the block: it has a session, and a thread that commits. Raises TrapsError."""
+        """Let this process write within the block, with a session and a commit thread. Raises TrapsError."""
         with self._guard:
             if not self._users:
                 self._begin()
@@ -118,13 +122,13 @@ class Database(ABC):
         try:
             yield
         except BaseException:
-            with suppress(TrapsError):  # the error of the block is what a person must know
+            with suppress(TrapsError):  # report the block's error, not this one
                 self._leave()
             raise
         self._leave()
 
     def submit(self, change: Change) -> Future[Any]:
-        """Add a change to the next transaction; its future is done when that is committed. Within `writing`."""
+        """Add a change to the next transaction; its future is done after the commit. Within `writing`."""
         future: Future[Any] = Future()
         self._queue.put((change, future))
         return future
@@ -140,8 +144,11 @@ class Database(ABC):
 
     @contextmanager
     def sharing(self, accounts: Collection[str]) -> Iterator[Callable[[str], int]]:
-        """Ask through these accounts within the block. The value tells how many processes do, this one among them, as
-        it was at the last beat. Raises TrapsError."""
+        """Use these accounts within the block, and announce that to other processes.
+
+        The yielded function returns the number of processes that use an account, this one included, as of the last
+        beat. Raises TrapsError.
+        """
         with self.writing():
             self.sharers |= dict.fromkeys(accounts, 1)
             self.submit(self._share).result()
@@ -153,7 +160,7 @@ class Database(ABC):
                 self.submit(self._unshare).result()
 
     def _share(self, batch: Batch) -> None:
-        """Say that this process asks through its accounts, and count who does."""
+        """Announce that this process uses its accounts, and count the processes that do."""
         now_s = self.now_s(batch.connection)
         self._unshare(batch)
         for account in self.sharers:
@@ -205,7 +212,7 @@ class Database(ABC):
             self.end()
 
     def _work(self) -> None:
-        """Commit what is in the queue, until it ends."""
+        """Commit queued changes until the queue ends."""
         shared_at = beaten_at = time.monotonic()
         while True:
             changes, is_last = list[tuple[Change, Future[Any]]](), False
@@ -229,11 +236,11 @@ class Database(ABC):
                 return
             if time.monotonic() - beaten_at > BEAT_S:
                 beaten_at = time.monotonic()
-                with suppress(TrapsError):  # told to the next one who needs the database
+                with suppress(TrapsError):  # reported to the next caller
                     self.beat()
 
     def _commit(self, changes: list[tuple[Change, Future[Any]]]) -> None:
-        """Apply changes in one transaction, and finish their futures. One that raises TrapsError changes nothing."""
+        """Apply changes in one transaction, and finish their futures. A change that raises TrapsError has no effect."""
         number = self._batch + 1
 
         def work(connection: sa.Connection) -> list[Any]:
@@ -267,7 +274,7 @@ class Database(ABC):
 
 
 def sentence(error: Exception, place: str) -> TrapsError:
-    """Return the error of a database as a sentence for people, without the statement and its values."""
+    """Return a database error as a sentence for people, without the statement and its values."""
     reason, remedy, _ = reason_and_remedy(error)
     return TrapsError(
         f"{place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything answered "

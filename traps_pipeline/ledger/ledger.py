@@ -1,7 +1,7 @@
-"""The ledger: a call is paid for once.
+"""The append-only ledger of calls: each is paid for once.
 
-Answers (and votes) are rows that are added as they come back, before anything counts them as done. An evaluation has
-one writer at a time.
+Answers (and votes) are rows, appended as they arrive and before anything counts them as done. An evaluation has one
+writer at a time.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.batch import Batch, claim
 from traps_pipeline.ledger.database import Database, Lock, sentence
 from traps_pipeline.ledger.rows import (
-    ASIDES,
     AVERAGED,
     NOT_WHOLE,
-    Known,
+    SIDE_TEXTS,
+    EvaluationRows,
     Stored,
     Totals,
     digest_of,
-    encoded,
+    encode_row,
     heal,
     participant_of,
     settles,
@@ -36,38 +36,38 @@ from traps_pipeline.ledger.rows import (
 from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES, TOTALS
 
 LOCK_POLL_S = 0.1
-SYNC_S = 0.5  # how often rows are brought to the disk
-_KEYS = 500  # of one query: SQLite takes 32,766 values
-_FETCHED = 1000  # rows that are fetched together
+SYNC_S = 0.5  # how often rows are synced to disk
+_KEYS = 500  # keys per query: SQLite takes 32,766 values
+_FETCHED = 1000  # rows per fetch
 
-Waiting = Callable[[str], None]  # is told once who is waited for
-GiveUp = Callable[[], bool]  # whether to wait no longer
+Waiting = Callable[[str], None]  # called once with the holder of the lock
+GiveUp = Callable[[], bool]  # returns whether to stop waiting
 
 
-def never() -> bool:
-    """Wait for ever."""
+def wait_forever() -> bool:
+    """Return False: wait without end."""
     return False
 
 
 class LockGivenUp(Exception):
-    """Waiting for a lock was stopped."""
+    """Waiting for a lock was cancelled."""
 
 
 class Ledger:
-    """Append-only rows by key, for each evaluation. kind: what the rows are, `answers` or `votes`."""
+    """Append-only rows by key, for each evaluation. kind: the kind of rows, `answers` or `votes`."""
 
     def __init__(self, database: Database, kind: str) -> None:
         self.database, self.kind = database, kind
 
     # --- reading ------------------------------------------------------------------------------------------------------
 
-    def read(self, evaluation: str, wanted: Collection[str] | None = None) -> Known:
-        """Return the rows of an evaluation, or of the wanted keys: no others are parsed or held in memory.
+    def read(self, evaluation: str, wanted: Collection[str] | None = None) -> EvaluationRows:
+        """Return the rows of an evaluation; with `wanted`, parse and hold only those keys.
 
-        Of a key with several rows the newest counts, but no failure in the place of an answer. Rows that are not what
-        was written, and values that no table can hold, are noted and not believed. Raises TrapsError.
+        If a key has several rows the newest counts, but a failure never replaces an answer. Damaged rows, and values
+        that no table can hold, are noted and ignored. Raises TrapsError.
         """
-        known = Known()
+        known = EvaluationRows()
         for place, row, note in self._parsed(evaluation, wanted):
             if note:
                 known.notes[place] = note
@@ -84,19 +84,20 @@ class Ledger:
         }
 
     def rows(self, evaluation: str) -> Iterator[Stored]:
-        """Yield every row of an evaluation as it was written, the oldest first, and what stands beside it. Rows that
-        are not what was written are left out. Raises TrapsError."""
+        """Yield every row of an evaluation as it was written, the oldest first, with its side texts.
+
+        Damaged rows are left out. Raises TrapsError.
+        """
         for row in self._rows(evaluation):
             if _is_whole(row):
-                asides = {name: getattr(row, name) for name in ASIDES}
+                asides = {name: getattr(row, name) for name in SIDE_TEXTS}
                 yield (
                     json.loads(row.content),
                     {name: text.decode() for name, text in asides.items() if text is not None},
                 )
 
     def damage(self) -> Iterator[str]:
-        """Yield a sentence for each row that is not what was written, and for what the database finds wrong in itself.
-        Reads all. Raises TrapsError."""
+        """Yield a sentence for each damaged row and each fault of the database. Reads everything. Raises TrapsError."""
         if self.database.exists():
             yield from self.database.faults()
         for evaluation in self.evaluations():
@@ -111,8 +112,10 @@ class Ledger:
         return [row.name for row in self._select(query)]
 
     def totals(self) -> dict[str, Totals]:
-        """Return what every row of every evaluation adds up to, by participant: repeated keys were paid for as well.
-        Raises TrapsError."""
+        """Return the totals of every row of every evaluation, by participant: repeated keys were paid for too.
+
+        Raises TrapsError.
+        """
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._mine(TOTALS))):
             sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
@@ -125,7 +128,7 @@ class Ledger:
         return (table.c.study == study) & (table.c.kind == self.kind)
 
     def _select(self, query: sa.Select[Any]) -> Iterator[sa.Row[Any]]:
-        """Yield the rows of a query; none where nothing was ever written."""
+        """Yield the rows of a query; none if the ledger does not exist."""
         if not self.database.exists():
             return
         with self.database.read() as connection:
@@ -151,7 +154,7 @@ class Ledger:
     def _parsed(
         self, evaluation: str, keys: Collection[str] | None
     ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
-        """Yield the place of each row, the row, and what is to be said of it."""
+        """Yield each row's place, the row, and a note about it."""
         for stored in self._rows(evaluation, keys):
             if not _is_whole(stored):
                 yield self._place(stored), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
@@ -170,10 +173,10 @@ class Ledger:
     # --- writing ------------------------------------------------------------------------------------------------------
 
     @asynccontextmanager
-    async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = never) -> AsyncIterator[Writer]:
-        """Become the one writer of an evaluation. While another process is, wait and report once which.
+    async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = wait_forever) -> AsyncIterator[Writer]:
+        """Become the one writer of an evaluation; while another process is, wait and report it once.
 
-        Raises LockGivenUp when `give_up` says so while waiting, and TrapsError.
+        Raises LockGivenUp when `give_up` returns true while waiting, and TrapsError.
         """
         with self.database.writing():
             lock = await self._lock(evaluation, waiting, give_up)
@@ -186,8 +189,10 @@ class Ledger:
                 lock.release()
 
     async def store(self, rows: Mapping[str, Sequence[Stored]], waiting: Waiting) -> int:
-        """Add rows of evaluations whose keys are not settled, all of them or none; the number of those that settle a
-        key. Nobody else writes to these evaluations meanwhile. Raises TrapsError."""
+        """Add rows of evaluations whose keys are not settled, all or none; return the number that settle a key.
+
+        Holds these evaluations' locks meanwhile. Raises TrapsError.
+        """
         async with AsyncExitStack() as stack:
             writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
             new = {
@@ -227,53 +232,52 @@ class Ledger:
 
 
 class _Content:
-    """A row as it is stored, encoded where it is added and not in the thread that commits."""
+    """A row in its stored form, encoded by the caller and not by the commit thread."""
 
     def __init__(self, row: Mapping[str, Any], content: bytes, asides: Mapping[str, bytes]) -> None:
         self.row, self.content, self.asides = row, content, asides
 
     @classmethod
     def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
-        """Raise ValueError for a row that JSON cannot hold."""
+        """Encode a row. Raises ValueError if JSON cannot hold it."""
         asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
-        return cls(row, encoded(row), asides)
+        return cls(row, encode_row(row), asides)
 
     def values(self, evaluation: int) -> dict[str, Any]:
-        asides = {name: self.asides.get(name) for name in ASIDES}
+        asides = {name: self.asides.get(name) for name in SIDE_TEXTS}
         digest = digest_of(self.row["key"], self.content, asides["reasoning"], asides["raw"])
         return {"evaluation": evaluation, "key": self.row["key"], "content": self.content, "digest": digest, **asides}
 
 
 class Writer:
-    """Adds rows to an evaluation, while nobody else does."""
+    """The only writer of an evaluation: adds rows to it."""
 
     def __init__(self, database: Database, kind: str, evaluation: int, lock: Lock) -> None:
         self._database, self._kind, self._evaluation, self._lock = database, kind, evaluation, lock
         self._is_synced = True
 
     async def require(self) -> None:
-        """Return if another call may be sent. Raises TrapsError when this writer is not the evaluation's any more."""
+        """Check that another call may be sent. Raises TrapsError if this writer has lost the evaluation."""
         if self._lock.is_fresh():
             self._lock.require()
-        else:  # calls in flight must not wait for a server that is away
+        else:  # calls in flight must not wait for an unreachable server
             await asyncio.to_thread(self._lock.require)
 
     async def write(
         self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None, paid_by: Sequence[str] = ()
     ) -> None:
-        """Add a row, what is kept beside it by name in ASIDES, and its cost to what was spent; return when no kill of
-        this process loses them.
+        """Add a row, its side texts and its cost; return once no kill of this process can lose them.
 
-        paid_by: reservations that the row's cost takes the place of. Raises TrapsError when nothing was stored, and
-        ValueError for a row that JSON cannot hold.
+        beside: texts by name in SIDE_TEXTS. paid_by: reservations that the row's cost replaces. Raises TrapsError if
+        nothing was stored, and ValueError for a row that JSON cannot hold.
         """
         content = _Content.of(row, beside)
         stored = self._database.submit(lambda batch: self.add(batch, content, paid_by))
-        await asyncio.shield(asyncio.wrap_future(stored))  # what was paid for is stored, whoever is cancelled
+        await asyncio.shield(asyncio.wrap_future(stored))  # store what was paid for even if the caller is cancelled
         self._is_synced = False
 
     async def write_all(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Add rows as `write` does, many in one transaction."""
+        """Add many rows as `write` does, in one transaction."""
         pending = iter(rows)
         while some := [_Content.of(row, None) for row in islice(pending, _FETCHED)]:
 
@@ -285,7 +289,7 @@ class Writer:
         self._is_synced = False
 
     def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
-        """Add a row to a transaction. Raises TrapsError where another process writes this evaluation now."""
+        """Add a row to a transaction. Raises TrapsError if another process now writes this evaluation."""
         self.check(batch)
         batch.rows.append(content.values(self._evaluation))
         participant = participant_of(content.row)
@@ -297,7 +301,7 @@ class Writer:
         batch.cover(participant, paid_by)
 
     def check(self, batch: Batch) -> None:
-        """Raise TrapsError where another process writes this evaluation now."""
+        """Raise TrapsError if another process now writes this evaluation."""
         if not batch.is_writer(self._evaluation):
             raise TrapsError(
                 f"{self._database.place}: another process has begun to ask the same calls, since this one was away; "
@@ -305,7 +309,7 @@ class Writer:
             )
 
     async def sync(self) -> None:
-        """Bring what was written to the disk. Raises TrapsError."""
+        """Sync the written rows to disk. Raises TrapsError."""
         if not self._is_synced:
             self._is_synced = True
             await asyncio.to_thread(self._database.sync)

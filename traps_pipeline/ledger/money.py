@@ -1,7 +1,7 @@
-"""A study's money: what was spent, what calls in flight may cost, and what a person gave back.
+"""A study's money: spent dollars, reservations of calls in flight, and releases by a person.
 
-A call's worst case is reserved before it is sent. The reservation goes when the row of the call is stored, in the same
-transaction. One whose process dies stays, and counts as spent for good, until a person releases it.
+A call's worst case is reserved before it is sent. The transaction that stores the call's row removes the reservation. A
+reservation of a dead process stays, and counts as spent, until a person releases it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,12 @@ from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS, TOTALS
 
 
 @dataclass(frozen=True)
-class Full:
-    """Why a call was not reserved. slot: the participant whose cap leaves no room, None for the study's; taken_usd: of
-    that cap, spent and reserved; others: sessions of other processes that hold reservations."""
+class CapExhausted:
+    """The reason why a call was not reserved.
+
+    slot: the participant whose cap is exhausted, None for the study's; taken_usd: spent and reserved under that cap;
+    others: sessions of other processes that hold reservations.
+    """
 
     slot: str | None
     taken_usd: float
@@ -32,8 +35,10 @@ class Full:
 
 @dataclass(frozen=True)
 class Releasable:
-    """Dollars of a participant that may be released. in_flight: of calls whose process died; failed: of calls that
-    came to nothing, as their rows have it."""
+    """A participant's dollars that may be released.
+
+    in_flight: of calls whose process died; failed: of calls that failed, by their rows.
+    """
 
     in_flight: float
     failed: float
@@ -45,33 +50,35 @@ class Money:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | Full]:
-        """Reserve dollars if every cap that counts leaves room; the reservation's id. caps: of each participant that
-        has one, and of the study (None)."""
+    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | CapExhausted]:
+        """Reserve dollars if every relevant cap leaves room; return the reservation's id, or why there is no room.
+
+        caps: of each participant that has one, and of the study (None).
+        """
         reservation = secrets.token_hex(8)
         slots = [slot for slot in (None, participant) if slot in caps]
 
-        def change(batch: Batch) -> str | Full:
+        def change(batch: Batch) -> str | CapExhausted:
             for slot in slots:
                 committed = sum(sum(_of(its, slot)) for its in (batch.spent, batch.reserved))
                 if caps[slot] - committed < usd - CENT:
-                    return Full(slot, committed, _others(batch))
+                    return CapExhausted(slot, committed, _others(batch))
             batch.reserve(reservation, participant, usd)
             return reservation
 
         return self._database.submit(change)
 
-    def forget(self, pending: Future[str | Full], participant: str, usd: float) -> None:
-        """Remove a reservation that nobody waits for any more, if it was made."""
+    def forget(self, pending: Future[str | CapExhausted], participant: str, usd: float) -> None:
+        """Remove an abandoned reservation, if it was made."""
         if not pending.cancelled() and pending.exception() is None and isinstance(pending.result(), str):
             self.settle(str(pending.result()), participant, usd, 0.0)
 
     def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> Future[None]:
-        """Put what a call costs into the place of its worst case, until the row of the call is stored."""
+        """Replace a reservation's worst case by the call's cost, until the row of the call is stored."""
         return self._database.submit(lambda batch: batch.settle(reservation, participant, was_usd, usd))
 
     def spent(self) -> dict[str, float]:
-        """Return dollars by participant: what rows cost, and what calls in flight may."""
+        """Return dollars by participant: costs of rows, and reservations of calls in flight."""
 
         def change(batch: Batch) -> dict[str, float]:
             return {
@@ -82,16 +89,18 @@ class Money:
         return self._database.submit(change).result()
 
     def is_any_alive(self, sessions: Iterable[str]) -> bool:
-        """Return whether any of these sessions goes on, so that its calls may turn out to cost less."""
+        """Return whether any of these sessions is alive, so that its calls may turn out to cost less."""
         return any(not self._database.is_dead(session) for session in sessions)
 
     def releasable(self) -> dict[str, Releasable]:
-        """Return what may be released, by participant."""
+        """Return the releasable dollars by participant."""
         return self._database.submit(self._releasable).result()
 
     def release(self, participant: str, usd: float | None, why: str, by: str, at: str) -> float:
-        """Release dollars of a participant (None: all of its calls in flight) and record it; how many. Raises
-        TrapsError where less is booked for calls that may never have left."""
+        """Release dollars of a participant (None: all of its calls in flight), record it, and return the amount.
+
+        Raises TrapsError if less is reserved for calls that may never have been sent.
+        """
 
         def change(batch: Batch) -> float:
             room = self._releasable(batch).get(participant, Releasable(0.0, 0.0))
@@ -114,7 +123,7 @@ class Money:
         return self._database.submit(change).result()
 
     def releases(self) -> list[Mapping[str, object]]:
-        """Return the records of what was released, the oldest first."""
+        """Return the records of all releases, the oldest first."""
         query = sa.select(RELEASES).order_by(RELEASES.c.id)
         return self._database.submit(
             lambda batch: [

@@ -1,8 +1,8 @@
-"""The ledger of several hosts: PostgreSQL, one direct connection of a process, which holds its locks.
+"""The ledger of several hosts: PostgreSQL, with one direct connection per process, which holds its locks.
 
-Where the connection is gone, so are the locks. A process that is silent for IDLE_S (stopped, or cut off) loses both. On
-a new connection it takes its locks again, unless another process has them; whether that one has written meanwhile, the
-writer of each evaluation tells (`Batch.is_writer`). PostgreSQL must be reached directly, not through a pool that shares
+Locks end with their connection. A process that is silent for IDLE_S (stopped, or cut off) loses both. On a new
+connection it takes its locks again, unless another process has them; `Batch.is_writer` tells the writer of each
+evaluation whether that one has written meanwhile. PostgreSQL must be reached directly, not through a pool that shares
 connections.
 """
 
@@ -32,10 +32,10 @@ from traps_pipeline.ledger.schema import EVALUATIONS, SESSIONS
 
 T = TypeVar("T")
 
-IDLE_S = 30.0  # after so long the server ends a connection that says nothing: its process is stopped
-OLD_S = 1.5  # locks that were seen so long ago allow no call
-PATIENCE_S = 60.0  # how long a run waits for a server that is away
-GRACE_S = 10  # after the server was started, those who held a lock before have so long to take it again
+IDLE_S = 30.0  # the server ends a connection that is idle for so long: its process is stopped
+OLD_S = 1.5  # locks checked longer ago than this allow no call
+PATIENCE_S = 60.0  # how long a run waits for an unreachable server
+GRACE_S = 10  # grace period after a server start for former holders to take their locks again
 RETRY_S = 0.2
 SKEW_S = 60  # Dagster compares times of several hosts to tell a run that never began; stores refuse 15 minutes
 KEEPALIVE: dict[str, Any] = {
@@ -47,22 +47,22 @@ KEEPALIVE: dict[str, Any] = {
 
 
 def awake_s() -> float:
-    """Return the seconds of a clock that goes on while this process is stopped or its machine sleeps."""
+    """Return a clock in seconds that runs on while this process is stopped or its machine sleeps."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def lock_number(name: str) -> int:
-    """Return the number of an advisory lock."""
+    """Return the number of a named advisory lock."""
     return int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), signed=True)
 
 
 class PostgresDatabase(Database):
-    """The ledger in a database that several hosts share. variable: of the environment, with its address."""
+    """The ledger in a database that several hosts share. variable: environment variable with its address."""
 
     def __init__(self, address: str, variable: str, study: str, idle_s: float = IDLE_S) -> None:
         super().__init__(study)
         self._variable, self._idle_s, self.patience_s = variable, idle_s, PATIENCE_S
-        self.application = f"traps {secrets.token_hex(8)}"  # what the server calls this process's connections
+        self.application = f"traps {secrets.token_hex(8)}"  # the server's ids of this process's connections
         try:
             urlsplit(address).port  # noqa: B018 - raises ValueError
             url = sa.make_url(address)
@@ -82,8 +82,8 @@ class PostgresDatabase(Database):
         self._guard_connection = threading.RLock()
         self._connection: sa.Connection | None = None
         self._is_working = False
-        self._held: dict[int, bool] = {}  # by number of a lock: whether it is still this process's
-        self._seen_s = float("-inf")  # when the locks were last seen to be there
+        self._held: dict[int, bool] = {}  # by lock number: whether this process still holds it
+        self._seen_s = float("-inf")  # when the locks were last checked
         self.run(self._compare_clocks, patience_s=0.0)
 
     @property
@@ -107,7 +107,7 @@ class PostgresDatabase(Database):
                 time.sleep(RETRY_S)
 
     def run(self, work: Callable[[sa.Connection], T], patience_s: float | None = None) -> T:
-        """See `Database.run`. What is done within another `run` of this thread belongs to its transaction."""
+        """See `Database.run`. A nested `run` in the same thread joins the outer transaction."""
         until = time.monotonic() + (self.patience_s if patience_s is None else patience_s)
         with self._guard_connection:
             if self._is_working and self._connection is not None:
@@ -130,7 +130,7 @@ class PostgresDatabase(Database):
                     self._is_working = False
 
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`. After the server was started, locks of other sessions stay theirs for a while."""
+        """See `Database.try_lock`. After a server start, other sessions' locks stay theirs for a grace period."""
         number = lock_number(f"{self.study_name}/{name}")
 
         def take(connection: sa.Connection) -> bool:
@@ -184,7 +184,7 @@ class PostgresDatabase(Database):
         self._seen_s = began
 
     def sync(self) -> None:
-        """See `Database.sync`. PostgreSQL has done it."""
+        """See `Database.sync`. PostgreSQL has synced already."""
 
     def now_s(self, connection: sa.Connection) -> float:
         """See `Database.now_s`."""
@@ -209,7 +209,7 @@ class PostgresDatabase(Database):
         return self._connection
 
     def _enter(self, connection: sa.Connection) -> None:
-        """Make a new connection this process's: end those before it, and take again what nobody else has taken."""
+        """Adopt a new connection: end the former ones, and retake locks that no other session has taken."""
         with connection.begin():
             for name in ("idle_session_timeout", "idle_in_transaction_session_timeout"):
                 connection.execute(sa.select(sa.func.set_config(name, f"{int(1000 * self._idle_s)}", False)))
@@ -268,7 +268,7 @@ class PostgresDatabase(Database):
         )
 
     def _compare_clocks(self, connection: sa.Connection) -> None:
-        """Raise TrapsError where this host's clock and the database's are too far apart."""
+        """Raise TrapsError if this host's clock and the database's are too far apart."""
         before = time.time()
         theirs = self.now_s(connection)
         apart = max(theirs - time.time(), before - theirs)
@@ -282,7 +282,7 @@ class PostgresDatabase(Database):
 
 
 def postgres_of(variable: str, study: str) -> PostgresDatabase:
-    """Return this process's database, whose address a variable of the environment holds. Raises TrapsError."""
+    """Return this process's database, whose address an environment variable holds. Raises TrapsError."""
     address = os.environ.get(variable)
     if not address:
         raise TrapsError(

@@ -1,4 +1,4 @@
-"""A ledger moved as it is: into a file, from a file, or into the database of several hosts."""
+"""Copy a ledger verbatim: to a file, from a file, or into the database of several hosts."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _FETCHED = 1000
 
 
 def export_ledger(ledger: Database, file: Path) -> int:
-    """Write a ledger to a file (SQLite), which must not exist; the number of rows. Raises TrapsError."""
+    """Write a ledger to a new SQLite file; return the number of rows. Raises TrapsError."""
     if file.exists():
         raise TrapsError(f"{file}: is there already; name another file")
     return copy_ledger(ledger, SqliteDatabase(file.parent, file=file.name))
 
 
 def import_ledger(file: Path, ledger: Database) -> int:
-    """Read the ledger of a file into a study that has none; the number of rows. Raises TrapsError."""
+    """Read the ledger of a file into a study that has none; return the number of rows. Raises TrapsError."""
     if not file.is_file():
         raise TrapsError(f"{file}: no such file; name one that `traps study export-ledger` wrote")
     source = SqliteDatabase(file.parent, file=file.name)
@@ -43,10 +43,10 @@ def import_ledger(file: Path, ledger: Database) -> int:
 
 
 def copy_ledger(source: Database, target: Database, settle: Callable[[], None] = lambda: None) -> int:
-    """Copy rows and money as they are, all or none, while nobody writes to the source; the number of rows.
+    """Copy all rows and money verbatim, or none, while nobody writes to the source; return the number of rows.
 
-    settle: called when all is there, before anybody else may write. A copy that was killed before its end is made
-    again. Raises TrapsError, also where the target has other rows.
+    settle: called after the copy, before others may write. A killed copy is repeated. Raises TrapsError, also if the
+    target has other rows.
     """
     mark = f"copied from {source.place}"
     with ExitStack() as opened:
@@ -76,7 +76,7 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
             "one by one with `traps study import-answers`"
         )
-    # What a copy that was killed has left, and evaluations without a row, would be in the way.
+    # Remove leftovers of a killed copy, and evaluations without a row.
     batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(mine)))
     for table in (TOTALS, SPENT, RELEASES, RESERVATIONS):
         batch.connection.execute(sa.delete(table).where(table.c.study == batch.study))

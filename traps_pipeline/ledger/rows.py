@@ -1,7 +1,7 @@
-"""Rows of the ledger: which values they may hold, what settles a key, and what rows add up to.
+"""Rows of the ledger: possible values, settled keys, and totals.
 
 A value that no table can hold, or that no call can have cost, is unknown. A provider's slip can thus neither keep a
-table from being made nor end a study.
+table from being built nor end a study.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any
 
-FAILED = ("error", "malformed")  # outcomes that settle nothing
-ASIDES = ("reasoning", "raw")  # texts kept beside rows, so that reading answers stays quick
+FAILED = ("error", "malformed")  # outcomes that settle no key
+SIDE_TEXTS = ("reasoning", "raw")  # texts kept beside rows, so that reading answers stays quick
 NOT_WHOLE = "not what was written"
-Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and what is kept beside it by name in ASIDES
+Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and its side texts by name in SIDE_TEXTS
 
 MOST_TOKENS = 10**9
-MOST_USD = 10_000.0  # of one call with all its attempts
+MOST_USD = 10_000.0  # limit for one call with all its attempts
 
 
 def is_cost(value: Any) -> bool:
-    """Return whether a call can have cost that much."""
+    """Return whether a value is a possible cost of one call, in dollars."""
     return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MOST_USD
 
 
 def is_seconds(value: Any) -> bool:
-    """Return whether a call can have taken so long."""
+    """Return whether a value is a possible duration of one call."""
     return type(value) in (int, float) and 0 <= value < math.inf
 
 
@@ -43,11 +43,11 @@ def _is_text(value: Any) -> bool:
 
 
 def is_count(value: Any) -> bool:
-    """Return whether a call can have taken so many tokens."""
+    """Return whether a value is a possible number of tokens of one call."""
     return type(value) is int and 0 <= value <= MOST_TOKENS
 
 
-# What a provider says; anything else is unknown.
+# A provider's fields, with a test for possible values; anything else is unknown.
 _SAID: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("text", "finish_reason", "error", "served_model", "client", "first_token"), _is_text),
     **dict.fromkeys(("prompt_tokens", "completion_tokens", "reasoning_tokens"), is_count),
@@ -56,8 +56,10 @@ _SAID: dict[str, Callable[[Any], bool]] = {
 
 
 def heal(row: dict[str, Any]) -> list[str]:
-    """Make values that no table can hold unknown, in place; the names of these fields. A text loses what cannot be
-    stored."""
+    """Replace impossible values by unknown ones, in place, and return the names of these fields.
+
+    A text loses the characters that cannot be stored.
+    """
     healed = []
     for name, fits in _SAID.items():
         value = row.get(name)
@@ -69,7 +71,7 @@ def heal(row: dict[str, Any]) -> list[str]:
     return healed
 
 
-# Columns whose means forecast what a call takes, and what is a possible value of each.
+# Columns whose means forecast a call, each with a test for possible values.
 AVERAGED: dict[str, Callable[[Any], bool]] = {
     "prompt_tokens": is_count,
     "completion_tokens": is_count,
@@ -83,19 +85,19 @@ def settles(row: Mapping[str, Any]) -> bool:
 
 
 def participant_of(row: Mapping[str, Any]) -> str:
-    """Return the model or judge that a row's call went to; `unknown` where the row does not say."""
+    """Return the model or judge of a row's call; `unknown` if the row does not name it."""
     components = row.get("components")
     participant = components.get("participant") if isinstance(components, Mapping) else None
     return participant if isinstance(participant, str) else "unknown"
 
 
-def encoded(row: Mapping[str, Any]) -> bytes:
-    """Return a row as JSON. Raises ValueError for NaN, which JSON does not have."""
+def encode_row(row: Mapping[str, Any]) -> bytes:
+    """Return a row as JSON. Raises ValueError for NaN, which JSON lacks."""
     return json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
 
 
 def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:
-    """Return the digest (16 bytes) that is stored with a row and held against it when it is read."""
+    """Return the digest (16 bytes) that is stored with a row and verified on reading."""
     digest = blake2b(key.encode(), digest_size=16)
     for aside in (content, reasoning, raw):
         digest.update(b"\0" if aside is None else b"\1" + aside)
@@ -103,11 +105,11 @@ def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | No
 
 
 @dataclass
-class Known:
-    """What a ledger holds for one evaluation.
+class EvaluationRows:
+    """The readable rows of one evaluation.
 
-    rows: the newest row of each key; a failure never takes the place of an answer. notes: by place, what a person
-    should know of rows that are not believed, or not all of them.
+    rows: the newest row of each key; a failure never replaces an answer. notes: by place, warnings about rows that are
+    ignored in full or in part.
     """
 
     rows: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -115,11 +117,11 @@ class Known:
 
     @property
     def settled(self) -> dict[str, dict[str, Any]]:
-        """The rows that need not be asked again."""
+        """The rows whose calls need no repetition."""
         return {key: row for key, row in self.rows.items() if settles(row)}
 
     def add(self, row: dict[str, Any]) -> None:
-        """Add a row that is newer than those before it."""
+        """Add a row that is newer than all rows so far."""
         earlier = self.rows.get(row["key"])
         if earlier is None or settles(row) or not settles(earlier):
             self.rows[row["key"]] = row
@@ -127,10 +129,10 @@ class Known:
 
 @dataclass
 class Totals:
-    """What rows of one participant add up to.
+    """Totals of one participant's rows.
 
-    dollars: paid; failed: of these, by rows that settle nothing; dearest: by one row; unknown: rows whose cost cannot
-    be; means: of the settled rows, sum and number of the values of each column of `AVERAGED`.
+    dollars: paid; failed: the part paid by rows that settle nothing; dearest: the highest cost of a row; unknown: rows
+    whose cost is impossible; means: sum and number of the values of each column of `AVERAGED`, over settled rows.
     """
 
     dollars: float = 0.0
@@ -154,14 +156,14 @@ class Totals:
                 self._add_to_mean(column, row[column], 1)
 
     def join(self, other: Totals) -> None:
-        """Count what other rows of the participant add up to."""
+        """Add another total of the same participant."""
         self.dollars, self.dearest = self.dollars + other.dollars, max(self.dearest, other.dearest)
         self.failed, self.unknown = self.failed + other.failed, self.unknown + other.unknown
         for column, (total, count) in other.means.items():
             self._add_to_mean(column, total, count)
 
     def mean(self, column: str) -> float | None:
-        """Return the mean of a column; None where no row has a value."""
+        """Return the mean of a column; None without values."""
         total, count = self.means.get(column, (0.0, 0))
         return total / count if count else None
 

@@ -81,7 +81,7 @@ SPENT = sa.Table(
     sa.Column("participant", sa.Text, primary_key=True),
     sa.Column("usd", sa.Double, nullable=False),
 )
-# Those of a session that ended count as spent for good, until a person releases them.
+# Reservations of a dead session count as spent until a person releases them.
 RESERVATIONS = sa.Table(
     "traps_reservations",
     METADATA,
@@ -91,7 +91,7 @@ RESERVATIONS = sa.Table(
     sa.Column("participant", sa.Text, nullable=False),
     sa.Column("usd", sa.Double, nullable=False),
 )
-# in_flight and failed: dollars given back of calls whose process died, and of failed calls.
+# in_flight and failed: released dollars of calls whose process died, and of failed calls.
 RELEASES = sa.Table(
     "traps_releases",
     METADATA,
@@ -104,7 +104,7 @@ RELEASES = sa.Table(
     sa.Column("by", sa.Text, nullable=False),
     sa.Column("at", sa.Text, nullable=False),
 )
-# Which sessions ask through an account; each says so anew every second or so (`seen_s`, seconds since 1970).
+# Sessions that use an account; each renews its row about every second (`seen_s`, seconds since 1970).
 SHARERS = sa.Table(
     "traps_sharers",
     METADATA,

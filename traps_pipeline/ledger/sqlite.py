@@ -1,7 +1,7 @@
-"""The ledger of one machine: a SQLite file in the study's folder, with locks that the kernel frees with their process.
+"""The ledger of one machine: a SQLite file in the study's folder, with locks that end with their process.
 
-What was committed survives a kill of the process at once, and a power cut from the next `sync` on. The file must lie on
-a disk of the machine itself: SQLite's log does not work over a network.
+A commit survives a kill of the process at once, and a power cut from the next `sync` on. The file must lie on a local
+disk: SQLite's write-ahead log does not work over a network.
 """
 
 from __future__ import annotations
@@ -24,12 +24,14 @@ from traps_pipeline.ledger.database import Database, Lock, sentence
 
 T = TypeVar("T")
 FILE = "ledger.sqlite"
-WAIT_S = 600.0  # for another process's transaction, on however slow a disk
+WAIT_S = 600.0  # to wait for another process's transaction on a slow disk
 
 
 class SqliteDatabase(Database):
-    """The ledger in a folder, which is made when something is written. A file holds one study, whatever that is called:
-    it can be copied into the folder of another."""
+    """The ledger in a folder, created on the first write.
+
+    A file holds one study, whatever its name: it can be copied into another study's folder.
+    """
 
     def __init__(self, folder: Path, study: str = "study", file: str = FILE) -> None:
         super().__init__(study)
@@ -51,7 +53,7 @@ class SqliteDatabase(Database):
     def _open(self) -> sqlite3.Connection:
         # A folder that cannot be written holds a file that nobody changes, and SQLite could not make its log there.
         is_fixed = self.path.exists() and not os.access(self.folder, os.W_OK)
-        # A log there is of a process that was killed: what it holds was committed, and `immutable` would not read it.
+        # A log left by a killed process holds committed rows, which `immutable` would not read.
         how = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
         uri = f"file:{quote(str(self.path))}" + (f"?{how}" if is_fixed else "")
         connection = sqlite3.connect(uri, uri=True, timeout=WAIT_S, isolation_level=None, check_same_thread=False)
@@ -83,7 +85,7 @@ class SqliteDatabase(Database):
                 raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
 
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`. A lock on a file."""
+        """See `Database.try_lock`. The lock is a file's."""
         path = self.folder / "locks" / f"{name}.lock"
         try:
             descriptor = try_lock(path)
@@ -94,16 +96,16 @@ class SqliteDatabase(Database):
 
         def release() -> None:
             with suppress(OSError):
-                path.unlink()  # first: a process that opened it meanwhile sees that its lock is on no file any more
+                path.unlink()  # first: a process that opened it meanwhile then sees that its lock file is gone
             os.close(descriptor)
 
         return Lock(release, lambda: require_in_place(descriptor, path))
 
     def sync(self) -> None:
-        """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done before.
+        """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done earlier.
 
-        The file itself must not be opened here: closing it would give up the locks by which SQLite tells other
-        processes that this one uses the log, and the next one that ends would remove it.
+        The file itself must not be opened here: closing it would release the locks by which SQLite tells other
+        processes that this one uses the log, and the next process to end would remove the log.
         """
         path = self.path.with_name(f"{self.path.name}-wal")
         try:
@@ -116,7 +118,7 @@ class SqliteDatabase(Database):
             raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
     def faults(self) -> Iterator[str]:
-        """See `Database.faults`: SQLite's own check, which finds rows that its index has and the table does not."""
+        """See `Database.faults`: SQLite's own check, which finds rows that are in an index but not in the table."""
         with self.read() as connection:
             try:
                 for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
@@ -126,7 +128,7 @@ class SqliteDatabase(Database):
                 raise sentence(error, self.place) from error
 
     def beat(self) -> None:
-        """See `Database.beat`. The kernel keeps them."""
+        """See `Database.beat`. The kernel keeps the locks."""
 
     def end(self) -> None:
         """See `Database.end`."""
@@ -138,9 +140,10 @@ class SqliteDatabase(Database):
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Begin a transaction as SQLite does by itself, or at once with the right to write, so that none is refused later.
+    """Begin a transaction as SQLite does by default, or immediately with the right to write.
 
-    The driver's own way to begin is switched off (`isolation_level=None`): it would begin only before a change.
+    With that right none of its changes fails later. The driver's own way to begin is switched off
+    (`isolation_level=None`): it would begin only before a change.
     """
     options: Any = connection.get_execution_options()
     connection.exec_driver_sql("begin" if options.get("is_reading") else "begin immediate")

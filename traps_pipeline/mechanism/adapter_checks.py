@@ -1,7 +1,7 @@
-"""What looking into a local model takes for granted, as checks that any adapter passes or says why not: `traps doctor
---local` runs them on a tiny checkpoint of each family, and on a model that is named; docs/local.md has the table.
+"""Check on any checkpoint, within seconds, what looking into a local model relies on; docs/local.md has the table.
 
-The tests go further (tests/models/local, tests/mechanism); a check is what can be held on any checkpoint in seconds.
+`traps doctor --local` runs the checks on a tiny checkpoint of each family, and on named models. The tests go further
+(tests/models/local, tests/mechanism).
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 SYSTEM = "You are asked about a video."
 QUESTIONS = ("Does it grow brighter?", "Does the picture end up bright, dark, or as it was?", "Which?")
 NEW_TOKENS = 8
-CLOSE = 1e-4  # of effects; and of means, relative to the largest state
+CLOSE = 1e-4  # tolerances of effects, and of means relative to the largest state
 EXACT = ("float32",)  # in 16 bits rounding differs with the shape of a batch
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and a clip to ask it about: frames (N, H, W, 3) uint8 RGB, two or more, and their times in seconds."""
+    """A model and a clip for its questions: frames (N, H, W, 3) uint8 RGB, two or more, and their times in seconds."""
 
     model: LocalModel
     frames: np.ndarray
@@ -61,15 +61,18 @@ class Subject:
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:
-        """Return steering by the random direction, at so many times the length of the state there."""
+        """Return steering by the random direction, with a strength in lengths of the state there."""
         length = float(np.linalg.norm(self.model.forward_states(self.prompts[0]).raw[self.layer]))
         return Steering(self.direction, self.layer, tuple(alpha * length for alpha in alphas))
 
 
 @dataclass(frozen=True)
 class Check:
-    """promise: what holds, in words. run: what was found, in a few words; raises TrapsError where it does not hold.
-    exact: it is held to the bit or nearly, so only in float32."""
+    """A promise of an adapter, and the function that checks it.
+
+    run: returns the observation in a few words; raises TrapsError if the promise is broken. exact: the check needs
+    float32, since it allows hardly any rounding.
+    """
 
     name: str
     promise: str
@@ -77,7 +80,7 @@ class Check:
     exact: bool = True
 
     def found(self, subject: Subject) -> str:
-        """Return what was found of a model. Raises TrapsError where the promise does not hold."""
+        """Run the check on a model and return its observation. Raises TrapsError if the promise is broken."""
         dtype = subject.model.params.dtype
         if self.exact and (dtype not in EXACT or subject.model.params.quantisation != "none"):
             return f"not looked at: in {dtype} rounding differs with the shape of a pass"
@@ -93,7 +96,7 @@ def _require(holds: bool, message: str) -> None:
 
 
 def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
-    """Return the library's own states of a prompt, (T, d) each: embeddings, outputs of blocks, the last one normed."""
+    """Return the library's own states of a prompt, (T, d) each: embeddings, block outputs, the last one normed."""
     import torch
 
     model = subject.model
@@ -216,8 +219,9 @@ def _batches(subject: Subject) -> str:
 
 @contextmanager
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
-    """Let a token that an answer has early end answers within the block, so that rows of a batch end at different
-    tokens."""
+    """Stop generation within the block at a token from an early answer, so that rows of a batch end at different
+    tokens.
+    """
     config = model.network.generation_config
     before, config.eos_token_id = config.eos_token_id, [token]
     try:
@@ -239,10 +243,10 @@ CHECKS = (
 
 
 def brightening() -> tuple[np.ndarray, np.ndarray]:
-    """Return a clip for the questions: four frames (4, 64, 96, 3), half a second apart."""
+    """Return a clip for the checks: four frames (4, 64, 96, 3), half a second apart."""
     return np.stack([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 40)]), np.arange(4) / 2
 
 
 def tiny_subject(family: Family, folder: Path) -> Subject:
-    """Return a tiny checkpoint of a family, built, saved and loaded again, and the clip."""
+    """Return a tiny checkpoint of a family, built, saved and reloaded, and the clip."""
     return Subject(tiny_model(family, folder / family), *brightening())

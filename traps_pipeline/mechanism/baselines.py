@@ -1,9 +1,9 @@
-"""What a probe must beat: the same protocol on raw inputs, on the model's own output, and on noise.
+"""Baselines for probes: the same protocol on raw inputs, on the model's own output, and on noise.
 
-Every baseline replaces the states of an item by other features and leaves the rest as it is: the same items, folds,
-solver, intervals and targets (`probing.ProbeRun`). A probe on states says nothing about understanding where the
-question's words, the first frame, the clip's length or the time stamps separate as well; and nothing about a gap
-between representation and output where the output margin does.
+Every baseline replaces an item's states by other features and keeps the rest: the same items, folds, solver, intervals
+and targets (`probing.ProbeRun`). A probe on states says nothing about understanding if the question's words, the first
+frame, the clip's length or the time stamps separate as well; and nothing about a gap between representation and output
+if the output margin does.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.tables import records
@@ -61,9 +61,9 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     raw = raw_features(items, entry.media, workspace.resolve)
     for number, (name, features) in enumerate(raw.items()):
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
-        add(name, scored(run, features))
+        add(name, score_features(run, features))
     try:
-        add(MARGIN, scored(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
+        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
     except NoMargin as error:
         add(MARGIN, [_without_figure()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
@@ -71,7 +71,7 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
 
 
 class AsItIs:
-    """A score that needs no fit: the one column of the features, larger for void."""
+    """A score without a fit: the only column of the features, larger for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
         """Return the column, (n,)."""
@@ -105,9 +105,9 @@ def raw_features(
 ) -> dict[str, Features]:
     """Return RAW features by name, then by dataset, (n, columns).
 
-    question words: which words and pairs of words the question has. first frame: its pixels at THUMBNAIL. all frames:
-    those of all frames that the model is shown, with the mean in the place of a missing one. length: the clip's last
-    frame time, s. time stamps: how many frames are shown, and their first, mean and last times, s.
+    question words: presence of single words and word pairs. first frame: its pixels at THUMBNAIL. all frames: those of
+    all frames that the model is shown, with the mean for a missing one. length: the clip's last frame time, s. time
+    stamps: the number of shown frames, and their first, mean and last times, s.
     """
     from sklearn.feature_extraction.text import CountVectorizer
 
@@ -138,8 +138,7 @@ def raw_features(
 
 
 def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return thumbnails (N, h, w, 3) in [0, 1] and times (N,) of the frames that a model is shown, and the last one's
-    time."""
+    """Return thumbnails (N, h, w, 3) in [0, 1] and times (N,) of the shown frames, and the clip's last frame time."""
     import cv2
 
     try:
@@ -151,12 +150,14 @@ def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 class NoMargin(TrapsError):
-    """The output margin of these states cannot be read."""
+    """The output margin of these states cannot be computed."""
 
 
 def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, list[int]]:
-    """Return the model whose head reads stored states, and the tokens with which it begins an abstention. Raises
-    NoMargin for states that are means over tokens, and for a model without such a token."""
+    """Return the model whose head reads stored states, and the tokens that begin an abstention.
+
+    Raises NoMargin for states that are means over tokens, and for a model without such a token.
+    """
     from traps_pipeline.mechanism.margin import abstention_tokens
     from traps_pipeline.models.local.adapter import load_local_model
 
@@ -170,8 +171,10 @@ def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, 
 
 
 def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
-    """Return the output margin of every item under the prompt of the extraction, (n, 1): no pass is made, the stored
-    state that left the final norm goes through the model's head. Raises NoMargin."""
+    """Return the output margin of every item under the prompt of the extraction, (n, 1).
+
+    No pass is needed: the stored state after the final norm goes through the model's head. Raises NoMargin.
+    """
     from traps_pipeline.mechanism.margin import first_token_margins
 
     model, tokens = margin_tokens(entry, states)
@@ -185,11 +188,11 @@ def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[s
 
 
 def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]:
-    """Return rows of the protocol on noise: mean over draws, and their deviation as `spread`.
+    """Return the protocol's rows on noise: mean over draws, and their standard deviation as `spread`.
 
-    Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items that are one prompt
-    (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows what shared
-    controls alone give, and `held_out` the floor after the split by scenario.
+    Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items with the same
+    prompt (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows the
+    effect of shared controls alone, and `held_out` the floor after the split by scenario.
     """
     items, width = run.items, int(run.items["width"].iloc[0])
     prompts, place = np.unique(items["states_key"].to_numpy(str), return_inverse=True)
@@ -197,12 +200,12 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     groups: dict[tuple[str, ...], list[Row]] = {}
     for draw in range(draws):
         vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
-        for row in scored(run, {name: vectors[rows] for name, rows in of.items()}):
+        for row in score_features(run, {name: vectors[rows] for name, rows in of.items()}):
             groups.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
     rows = []
     for same in groups.values():
         values = np.array([row["value"] for row in same], float)
-        if np.isnan(values).any():  # a figure that cannot be computed of these items, whatever their features are
+        if np.isnan(values).any():  # no features of these items allow this figure
             continue
         rows.append(same[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
     return rows

@@ -1,4 +1,4 @@
-"""The tables of controls: what stands beside a probe, a direction or a steered answer, so that a claim can fail."""
+"""Tables of control analyses for probes, directions and steered answers, which let a claim fail."""
 
 from dataclasses import dataclass
 from typing import Annotated

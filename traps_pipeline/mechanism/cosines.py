@@ -1,8 +1,8 @@
-"""Cosines of void directions, with what few pairs take away from them and shared controls add.
+"""Cosines of void directions, corrected for few pairs and shared controls.
 
-A direction is a mean over pairs, so its noise makes its cosine with any other direction too small, and where two
-datasets have the same controls, their common noise makes it too large. Products of *different* scenarios have neither:
-the disattenuated cosine is made of them alone. The split half says how far other pairs give the same direction.
+A direction is a mean over pairs, so its noise makes its cosine with any other direction too small, and if two datasets
+have the same controls, their common noise makes it too large. Products of *different* scenarios have neither: the
+disattenuated cosine uses only them. The split half says how far other pairs give the same direction.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.directions import cosine_matrix
 from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, CosineRow
-from traps_pipeline.mechanism.nulls import nulled
+from traps_pipeline.mechanism.nulls import nan_to_null
 from traps_pipeline.mechanism.stages import direction_pairs, saved_directions
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import FAMILIES
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import taxonomy_of
@@ -30,7 +30,7 @@ RESAMPLES, HALVINGS = 200, 50
 
 @dataclass(frozen=True, eq=False)
 class PairDifferences:
-    """Void minus control state of each pair of a direction, (n, d), and the number of each pair's scenario, (n,)."""
+    """Void minus control state of each pair of a direction, (n, d), and the scenario number of each pair, (n,)."""
 
     values: np.ndarray
     scenario: np.ndarray
@@ -39,7 +39,7 @@ class PairDifferences:
 def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
     """Return the mean product of pairs of different scenarios, (draws,): an unbiased product of two mean differences.
 
-    weights: (draws, scenarios), how often each scenario counts.
+    weights: (draws, scenarios), the count of each scenario.
     """
     products = one.values @ other.values.T
     differ = (one.scenario[:, None] != other.scenario).astype(float)
@@ -49,15 +49,17 @@ def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> 
 
 
 def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the cosine of two mean differences without the noise of their pairs, (draws,); it may lie beyond 1, and is
-    NaN where a mean difference is not longer than its noise."""
+    """Return the cosine of two mean differences without the noise of their pairs, (draws,).
+
+    It may exceed 1, and is NaN if a mean difference is not longer than its noise.
+    """
     lengths = apart(one, one, weights) * apart(other, other, weights)
     known = (lengths > 0) & (apart(one, one, weights) > 0)
     return np.where(known, apart(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
-    """Return the cosine between the directions of two halves of the pairs, mean over random halvings."""
+    """Return the cosine between directions of two halves of the pairs, averaged over random halvings."""
     products, n = of.values @ of.values.T, len(of.values)
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
@@ -68,7 +70,10 @@ def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
 
 
 def cosine_rows(workspace: Workspace) -> list[CosineRow]:
-    """Return the rows of COSINES: every two void directions of a model at one layer, over datasets and VQA prompts."""
+    """Return the rows of COSINES: all pairs of a model's void directions at one layer.
+
+    The pairs are over datasets and VQA prompts.
+    """
     table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []
@@ -110,7 +115,9 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
                             other_prompt=other.extraction.prompt,
                             other_dataset=other_dataset,
                             cosine=float(cosines[i, j]),
-                            **nulled(_figures(differences[i], differences[j], weights) | {"split_half": halves[i]}),
+                            **nan_to_null(
+                                _figures(differences[i], differences[j], weights) | {"split_half": halves[i]}
+                            ),
                         )
                     )
     return rows
@@ -125,8 +132,7 @@ def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) 
 
 
 def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
-    """Return how often each scenario counts, (1 + RESAMPLES, scenarios): first once, then resampled within its
-    taxonomy."""
+    """Return each scenario's count, (1 + RESAMPLES, scenarios): first 1, then resampled within its taxonomy."""
     weights, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
         if n := int(np.count_nonzero(of == taxonomy)):

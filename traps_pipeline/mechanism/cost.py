@@ -1,7 +1,7 @@
-"""What local models cost, for `traps plan`: passes, tokens, hours of a named GPU, and memory.
+"""Estimate the cost of local models for `traps plan`: passes, tokens, GPU-hours and memory.
 
-Arithmetic, not measurement: a pass takes 2 operations a parameter and token, and steps of decoding are bound by the
-launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
+The estimate is arithmetic, not measurement: a pass takes 2 operations per parameter and token, and decoding steps are
+bound by the launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from traps_pipeline.storage.study import MechanismSettings
 
 TEXT_TOKENS = 220  # system prompt, question and chat template
 CLIP_S = 5.0
-REACHED = 0.4  # of a card's operations, by passes over prompts
-STEP_S = 0.7e-3  # of a block in a step of decoding, however many rows
-NF4_TIMES = 2.0  # as long, since weights are unpacked at every use
-NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # a parameter
-ROWS = 64  # of a batch of answers
-WIDEST = 28  # numbers a token and unit of width in a block's widest moment
-GRAPH = 18  # numbers a token, block and unit of width that a backward pass keeps
-SOURCES = 4  # of a patch: the other side, and three nulls
+REACHED = 0.4  # share of a card's operations that passes over prompts reach
+STEP_S = 0.7e-3  # per block and decoding step, for any number of rows
+NF4_TIMES = 2.0  # factor on time, since weights are unpacked at every use
+NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # per parameter
+ROWS = 64  # rows of a batch of answers
+WIDEST = 28  # numbers per token and unit of width at a block's peak
+GRAPH = 18  # numbers per token, block and unit of width that a backward pass keeps
+SOURCES = 4  # sources of patches: the other side, and three nulls
 
 
 @dataclass(frozen=True)
 class Card:
-    """A GPU by its data sheet: dense operations a second in bfloat16, and bytes a second from its memory."""
+    """A GPU's data sheet: dense operations a second in bfloat16, and memory bandwidth in bytes a second."""
 
     operations: float
     bandwidth: float
@@ -44,7 +44,7 @@ CARDS = {
 
 @dataclass(frozen=True)
 class Work:
-    """New work of one kind: passes over prompts, and answers with so many tokens each (0: none are generated)."""
+    """Work of one kind: passes over prompts, and answers with a number of tokens each (0: none are generated)."""
 
     kind: str
     passes: float
@@ -53,7 +53,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Cost:
-    """What one kind of work takes of one model. hours, gigabytes: None where the entry names no `size`."""
+    """The cost of one kind of work on one model. hours, gigabytes: None if the entry names no `size`."""
 
     model: str
     kind: str
@@ -65,7 +65,7 @@ class Cost:
 
 
 def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
-    """Return the passes of states, sentences, random weights and patching. scenarios: their number by taxonomy."""
+    """Return the passes for states, sentences, random weights and patching. scenarios: their number by taxonomy."""
     paired = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     beside = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
     beside += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
@@ -84,7 +84,7 @@ def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenario
 
 
 def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quantised: bool) -> Cost:
-    """Return what work takes of a model that is shown clips so. quantised: whether its weights are in NF4."""
+    """Return the cost of work on a model that is shown clips by `media`. quantised: whether its weights are in NF4."""
     frames = media.uniform or min(media.most, round((media.fps or 1) * CLIP_S))
     prompt = frames * entry.tokens_per_frame + TEXT_TOKENS
     tokens_in, tokens_out = work.passes * prompt, work.passes * work.answer_tokens
@@ -95,7 +95,7 @@ def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quan
     weights = parameters * (NF4_BYTES if quantised else BFLOAT16_BYTES)
     seconds = 2 * parameters * tokens_in / (REACHED * card.operations)
     seconds += tokens_out / ROWS * max(layers * STEP_S, weights / card.bandwidth)
-    state = prompt * width * BFLOAT16_BYTES  # of one layer
+    state = prompt * width * BFLOAT16_BYTES  # bytes of one layer
     extra = (4 * layers + 2 + GRAPH * layers) * state if work.kind == "patching" else WIDEST * state
     return Cost(
         entry.id, work.kind, passes, tokens_in, tokens_out,

@@ -1,13 +1,12 @@
-"""Whether a steered text is still an answer: a model that is pushed far enough babbles, and a judge may call it either
-abstention or an answer."""
+"""Detect degenerate steered texts, which a judge could call either abstention or answer."""
 
 from __future__ import annotations
 
 import unicodedata
 from collections import Counter
 
-REPEATED = 4  # times in a row that the same words make a repetition
-LONGEST = 8  # words of a repeated phrase
+REPEATED = 4  # consecutive occurrences that make a repetition
+LONGEST = 8  # maximum words of a repeated phrase
 
 
 def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | None:
@@ -15,7 +14,7 @@ def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | N
 
     `truncated`: the limit of tokens cut it off (outcome). `repetition`: a phrase of one to eight words stands four
     times in a row. `script`: most of its letters are of another script than those of the unsteered answer to the same
-    item. A text that is missing is `empty`.
+    item. `empty`: the text is missing.
     """
     if outcome == "truncated":
         return outcome

@@ -1,7 +1,7 @@
-"""Void directions: the mean difference between voids and controls, as a value that is saved (docs/spec.md 8.1).
+"""Void directions: the mean difference between voids and controls, saved as files (docs/spec.md 8.1).
 
 A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. Its nulls are unit vectors too, drawn
-from three distributions and made orthogonal to it, so that no null contains a part of what it is compared with:
+from three distributions and made orthogonal to it, so that no null contains a part of the direction:
 
 - `isotropic`: every direction is equally likely;
 - `covariance`: drawn from the covariance of the states within a side, so that a null lies where states vary;
@@ -29,7 +29,7 @@ VOID = "void"
 NULLS = ("isotropic", "covariance", "shuffled")
 KINDS = (VOID, *NULLS)
 _LENGTHS = ("gaps", "residual_norms")
-_NOTHING_LEFT = 1e-5  # share of a null's length below which what the projection leaves is rounding
+_NOTHING_LEFT = 1e-5  # share of a null's length below which the remainder of the projection is rounding error
 SITE = "output of the block, before the next one (residual stream); layer 0: embeddings"
 
 
@@ -37,14 +37,15 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """Return the scenarios in an order by seed and name alone, so that a discarded one does not change the others'
-    order."""
+    """Return the scenarios in an order by seed and name alone, so that a discarded one does not move the others."""
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
 def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the first n scenarios of the seeded order of a taxonomy, which are steered along every direction that does
-    not come from them."""
+    """Return the first n scenarios of a taxonomy's seeded order.
+
+    They are steered along every direction that does not come from them.
+    """
     return seeded_order(scenarios, seed)[:n]
 
 
@@ -58,7 +59,7 @@ def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of a set of directions, which is written into the JSON file beside the tensors."""
+    """The provenance of a set of directions, which is written into the JSON file beside the tensors."""
 
     model: str
     checkpoint: str
@@ -76,9 +77,12 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions of one dataset at every layer. vectors: kind -> (draws, layers, d) float32 unit vectors, with one draw
-    of kind void. gaps: (layers,), length of mean(h_void) - mean(h_control), the class gap. residual_norms: (layers,),
-    mean length of the control states. scenarios: of the pairs that they come from, which are not steered along them."""
+    """Directions of one dataset at every layer.
+
+    vectors: kind -> (draws, layers, d) float32 unit vectors, with one draw of kind void. gaps: (layers,), length of
+    mean(h_void) - mean(h_control), the class gap. residual_norms: (layers,), mean length of the control states.
+    scenarios: those that the directions come from, which are not steered along them.
+    """
 
     vectors: Mapping[str, np.ndarray]
     gaps: np.ndarray
@@ -92,19 +96,18 @@ class Directions:
 
     @property
     def n_layers(self) -> int:
-        """Layers, the embeddings included."""
+        """Number of layers, the embeddings included."""
         return len(self.residual_norms)
 
 
 def extract_directions(
     void: np.ndarray, control: np.ndarray, seed: Sequence[int], nulls: Sequence[str] = NULLS, draws: int = 1
 ) -> Directions:
-    """Return directions from states (layers, pairs, d) of the two sides, with the pairs in the same order, and so many
-    draws of each kind of null.
+    """Return directions from states (layers, pairs, d) of the two sides, with several draws of each kind of null.
 
-    A layer at which the sides do not differ at all (the embeddings of a last token that is the same everywhere) has a
-    zero vector, not a direction that consists of rounding errors; so has a null of which the projection leaves nothing.
-    Raises TrapsError with fewer than two pairs.
+    The pairs of both sides are in the same order. A layer at which the sides do not differ at all (the embeddings of a
+    last token that is the same everywhere) has a zero vector, not a direction that consists of rounding errors; so has
+    a null that the projection leaves empty. Raises TrapsError with fewer than two pairs.
     """
     if void.shape != control.shape or void.ndim != 3 or void.shape[1] < 2:
         raise TrapsError(
@@ -137,8 +140,10 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
 
 
 def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return the unit vectors of what is left of draws (draws, layers, d) without their part along `unit` (layers, d);
-    zero where hardly anything is left, and where `unit` itself is zero."""
+    """Return unit vectors of draws (draws, layers, d) after removing their part along `unit` (layers, d).
+
+    Zero if hardly anything is left, and if `unit` itself is zero.
+    """
     remainder = vectors - (vectors * unit).sum(axis=2, keepdims=True) * unit
     remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
     before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (vectors, remainder))
@@ -153,8 +158,10 @@ def vector_digest(vector: np.ndarray) -> str:
 
 
 def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
-    """Write `path` (safetensors: kind -> (draws, layers, d), gaps and residual_norms -> (layers,)), and a JSON file of
-    the same name that says what it holds. Raises TrapsError when the disk is full."""
+    """Write `path` (safetensors) and a JSON file of the same name that describes it.
+
+    Tensors: kind -> (draws, layers, d), gaps and residual_norms -> (layers,). Raises TrapsError if the disk is full.
+    """
     require("local")
     from safetensors.numpy import save
 
@@ -166,8 +173,10 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
-    """Return the directions that `save_directions` wrote, and the content of their JSON file. Raises TrapsError when a
-    file is missing, or when the digest in the JSON file is another."""
+    """Return the directions that `save_directions` wrote, and the content of their JSON file.
+
+    Raises TrapsError if a file is missing, or if its digest differs from the one in the JSON file.
+    """
     require("local")
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
@@ -191,7 +200,7 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
 
 
 def cosine_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Return cosines of unit vectors (k, d): (k, k). NaN where one of the two is zero."""
+    """Return cosines of unit vectors (k, d): (k, k). NaN if either is zero."""
     vectors = np.asarray(vectors, np.float64)
     lengths = np.linalg.norm(vectors, axis=1)
     with np.errstate(invalid="ignore"):

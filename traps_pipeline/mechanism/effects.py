@@ -1,4 +1,4 @@
-"""The figures of the steering tables, from effects: abstention by path, strength and side (docs/spec.md 8.4).
+"""Compute the figures of the steering tables: abstention by path, strength and side (docs/spec.md 8.4).
 
 Effects are rows of the `steering_effects` table, or the paper's in the same columns: model, directions, regime, source,
 target, kind, layer, alpha, side, abstention (a fraction).
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["model", "directions", "regime"]
-BESIDE = ("n", "gaps", "broken")  # of an effect: answers, dose in class gaps, share of degenerate ones
+BESIDE = ("n", "gaps", "broken")  # answers, dose in class gaps, share of degenerate answers
 REGIME_COLUMNS = (
     *("model", "path_set", "family", "directions", "regime", "kind", "n_paths", "alpha"),
     *("control_0", "control_top", "void_0", "void_top"),
@@ -26,17 +26,17 @@ REGIME_COLUMNS = (
 
 
 def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the effects at the steered layer, which alone has both sides: a sweep's further layers have only
-    controls.
-    """
+    """Return the effects at the steered layer; other layers of a sweep have only controls."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per path and strength at the steered layer, with transfer_type and the abstention of control and
-    void; if the effects have intervals, counts, doses in class gaps or shares of degenerate answers, also `control_low`
-    and so on."""
+    """Return one row per path and strength at the steered layer, with transfer_type and both sides' abstention.
+
+    If the effects have intervals, counts, doses in class gaps or shares of degenerate answers, there are also columns
+    `control_low` and so on.
+    """
     import pandas as pd
 
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
@@ -60,8 +60,7 @@ def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of `regime_matrix` for guided directions under guided inference, by taxonomy of the
-    direction's source (`family`)."""
+    """Return the columns of `regime_matrix` for guided directions and inference, by source taxonomy (`family`)."""
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
     return _regime_rows(guided, taxonomy_of)
 
@@ -84,8 +83,11 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention at the largest alpha along each source's direction: on the well-posed dataset of the
-    source's own taxonomy (same) and of the other taxonomy (cross). Columns CELL, source, alpha, same, cross."""
+    """Return control abstention at the largest alpha along each source's direction, within and across domains.
+
+    same: on the well-posed dataset of the source's own taxonomy; cross: on that of the other. Columns CELL, source,
+    alpha, same, cross.
+    """
     import pandas as pd
 
     rows = paths(effects)
@@ -101,8 +103,10 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention by layer and alpha, with each dataset's direction on its own controls, as a mean over
-    the four datasets. Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered."""
+    """Return control abstention by layer and alpha, averaged over each dataset's direction on its own controls.
+
+    Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered.
+    """
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
     grouped = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
@@ -112,8 +116,10 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the effects of every dataset along its own direction and its nulls, signs by label, at the layer that has
-    both sides; with `gaps`, the dose in units of the class gap. Without a dose in that unit there are no rows."""
+    """Return the effects of every dataset's own direction and its nulls, signs by label, at the layer with both sides.
+
+    `gaps` holds the dose in units of the class gap; without a dose in that unit there are no rows.
+    """
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     both = own.loc[own["side"] == "void", ["model", "layer"]].drop_duplicates()
     own = in_gaps(own.merge(both, on=["model", "layer"]), own)
@@ -121,8 +127,10 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
-    """Return effects with `gaps`, their strength in units of the class gap of the direction's own dataset, which is
-    read off the doses in that unit among `every` effect; NaN where there is none."""
+    """Return effects with `gaps`, their strength in units of the class gap of the direction's own dataset.
+
+    The gap is inferred from the doses in that unit among `every` effect; NaN without any.
+    """
     keys = ["model", "directions", "source", "layer"]
     length = every.loc[(every["unit"] == "gap") & (every["dose"] > 0) & (every["kind"] == "void")]
     length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)

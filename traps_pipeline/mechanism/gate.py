@@ -1,12 +1,12 @@
 """Probe-gated abstention: a linear probe on the model's states decides whether the model's answer is kept.
 
-The paper's probes find that states separate what can be known from what cannot, while answers do not. A gate puts that
-to use: where the probe's score is above a threshold, the answer becomes an abstention. Nothing is asked and nothing is
-judged again: a gated answer is an abstention, and every other answer keeps its verdict.
+The paper's probes find that states separate what can be known from what cannot, while answers do not. A gate uses that:
+if the probe's score is above a threshold, the answer becomes an abstention. No call is made and no answer is judged
+again: a gated answer is an abstention, and every other answer keeps its verdict.
 
-No gate has seen the scenario that it decides about, in its fit or in its threshold. Its sources say how much more it
-has not seen: `one:DATASET` (one dataset), `other datasets` (all but the target) and `other families` (no scenario of
-the target's family in any dataset).
+No gate has seen the scenario that it decides about, in its fit or in its threshold. Its source says what else it has
+not seen: `one:DATASET` (fitted on one dataset), `other datasets` (all but the target) and `other families` (no scenario
+of the target's family in any dataset).
 """
 
 from __future__ import annotations
@@ -26,31 +26,37 @@ from traps_pipeline.scoring.metrics import pecs_of
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
 OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"
 SOURCES = (*(f"one:{name}" for name in DATASETS), OTHER_DATASETS, OTHER_FAMILIES)
-NEVER = float("inf")  # a threshold that no score exceeds
+NEVER = float("inf")  # threshold above every score
 
 
 @dataclass(frozen=True, eq=False)
 class Items:
-    """What a gate is fitted on and applied to. table: rows with dataset, scenario_id, family, prompt (equal for items
-    that are one prompt) and void (bool). features: (n, d), rows in the same order."""
+    """Items that a gate is fitted on and applied to.
+
+    table: rows with dataset, scenario_id, family, prompt (equal for items with the same prompt) and void (bool).
+    features: (n, d), rows in the same order.
+    """
 
     table: pd.DataFrame
     features: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Items:
-        """Return the items that a boolean mask chooses."""
+        """Return the items that a boolean mask selects."""
         return Items(self.table.loc[chosen].reset_index(drop=True), self.features[chosen])
 
     @property
     def void(self) -> np.ndarray:
-        """(n,) bool."""
+        """Whether each item is a void, (n,) bool."""
         return self.table["void"].to_numpy(bool)
 
 
 @dataclass(frozen=True, eq=False)
 class Decisions:
-    """A gate's decisions about some items. place: (n,) rows of the items' table. score: (n,) log-odds of void.
-    threshold: by name, (n,). expected: by name, (n,) share of the calibrating controls above the threshold."""
+    """A gate's decisions about some items.
+
+    place: (n,) rows of the items' table. score: (n,) log-odds of void. threshold: by name, (n,). expected: by name,
+    (n,) share of the calibrating controls above the threshold.
+    """
 
     place: np.ndarray
     score: np.ndarray
@@ -77,7 +83,7 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
 
 
 def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS) -> list[str]:
-    """Return the datasets that a gate of SOURCES is fitted on for a target, of those that a study has."""
+    """Return the study's datasets that a gate of a source (one of SOURCES) is fitted on for a target."""
     if source == OTHER_DATASETS:
         return [name for name in datasets if name != target]
     return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
@@ -87,9 +93,8 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
     """Return the decisions of the gates of a source about every item of a target dataset.
 
     A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
-    other scenarios. Its thresholds come from scores of those same source items in a cross-validation of their own, so
-    that they are scores of unseen items too; items that are one prompt count once. Raises TrapsError for a source
-    without items.
+    other scenarios. Its thresholds come from cross-validated scores of those same source items, so that they are scores
+    of unseen items too; items with the same prompt count once. Raises TrapsError for a source without items.
     """
     targets = items.table["dataset"].to_numpy(str)
     scored = np.flatnonzero(targets == target)
@@ -124,7 +129,7 @@ def fit_gate(
 
 
 def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield the groups of scored items that a gate must not have seen, one gate after another."""
+    """Yield the groups of scored items to hold out, one gate after another."""
     names = np.unique(groups)
     if source == OTHER_FAMILIES or len(names) < folds:
         yield from (names[k : k + 1] for k in range(len(names)))
@@ -152,15 +157,17 @@ def _own_scores(train: Items, folds: int, seed: int) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
-    """Verdicts of a target's items, (n,) each: void; correct (of controls) and abstained, NaN where undecided."""
+    """Verdicts of a target's items, (n,) each: void; correct (of controls) and abstained, NaN if undecided."""
 
     void: np.ndarray
     correct: np.ndarray
     abstained: np.ndarray
 
     def gated(self, gate: np.ndarray) -> Outcomes:
-        """Return the outcomes after a gate (n,) bool has turned answers into abstentions. An undecided answer that is
-        gated is decided: it abstains."""
+        """Return the outcomes after a gate (n,) bool has turned answers into abstentions.
+
+        A gated undecided answer counts as an abstention.
+        """
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
     def figures(self) -> dict[str, float]:
@@ -172,7 +179,7 @@ class Outcomes:
         return {name: float(value) for name, value in shares.items()}
 
     def counts(self) -> np.ndarray:
-        """Return how often each item is yes and is decided for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""
+        """Return numerators and denominators of each item for Acc, FalseAbs and AbsRec: (n, 6), as COUNTS."""
         parts = ((~self.void, self.correct), (~self.void, self.abstained), (self.void, self.abstained))
         decided = [side & np.isfinite(values) for side, values in parts]
         yes = [np.where(decision, values, 0.0) for decision, (_, values) in zip(decided, parts, strict=True)]
@@ -180,11 +187,11 @@ class Outcomes:
 
 
 def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Return (coverage, risk, answers kept) where answers are given up from the highest score down.
+    """Return (coverage, risk, answers kept) as answers are withheld from the highest score down.
 
     Answered items are those on which the model did not abstain. Coverage is the share of all items that are answered
-    and kept; risk the share of kept answers that are wrong: every answer to a void, and a control's that is not
-    correct. Coverages beyond the share of answered items are left out.
+    and kept; risk is the share of kept answers that are wrong: every answer to a void, and every incorrect answer to a
+    control. Coverages above the share of answered items are left out.
     """
     answered = outcomes.abstained == 0
     wrong = np.where(outcomes.void, 1.0, 1 - outcomes.correct)

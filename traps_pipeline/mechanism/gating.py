@@ -31,9 +31,9 @@ from traps_pipeline.mechanism.gate import (
 )
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBES
-from traps_pipeline.mechanism.nulls import nulled
+from traps_pipeline.mechanism.nulls import nan_to_null
 from traps_pipeline.mechanism.probes import swapped_labels
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -57,8 +57,10 @@ _PECS = RESAMPLED.index("pecs")
 
 @dataclass(frozen=True)
 class Gates:
-    """A kind of features with the sources of the gates that use it. by_layer: by layer of the states (-1 for other
-    features), then by dataset, (n, d)."""
+    """A kind of features, and the sources of its gates.
+
+    by_layer: by layer of the states (-1 for other features), then by dataset, (n, d).
+    """
 
     name: str
     by_layer: Mapping[int, Mapping[str, np.ndarray]]
@@ -66,9 +68,9 @@ class Gates:
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
-    """Return rows of GATE of an extraction, for each regime that the model was asked under in run 1.
+    """Return rows of GATE of an extraction, for each regime in which the model was evaluated in run 1.
 
-    Raises TrapsError when the model has no verdicts yet.
+    Raises TrapsError if the model has no verdicts yet.
     """
     resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
     return [
@@ -79,7 +81,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
-    """Return rows of RISK_COVERAGE of an extraction: gates from other datasets, and as `gate_rows` else."""
+    """Return rows of RISK_COVERAGE of an extraction, for gates from other datasets; otherwise as `gate_rows`."""
     return [
         row
         for regime, outcomes, gates, _, decided in _each(workspace, entry, states, (OTHER_DATASETS,))
@@ -114,14 +116,14 @@ def _each(
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return the items of all datasets in the order of `states.items`, as a gate wants them."""
+    """Return the items of all datasets in the order of `states.items`, in the form of `gate.Items.table`."""
     items = states.items
     named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
-    """Return the layer of the gates of each target, chosen without its labels (`layer_choice`)."""
+    """Return the layer of each target's gates, chosen without its labels (`layer_choice`)."""
     rows = workspace.tables.read(PROBES, states.extraction.partition).to_dict("records")
     curves = pair_curves({str(name): value for name, value in row.items()} for row in rows)
     return {target: layer_choice(curves, target).layer for target in targets}
@@ -130,7 +132,7 @@ def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[
 def _kinds(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int], sources: Sequence[str]
 ) -> Iterator[Gates]:
-    """Yield states with every source; the controls with the sources that no single dataset's accidents decide."""
+    """Yield states with every source, and control features with the sources that combine several datasets."""
     names = [*dict.fromkeys(states.items["dataset"])]
     by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
     yield Gates(STATES, by_layer, sources)
@@ -165,7 +167,7 @@ def _decisions(
     present = [name for name in DATASETS if name in set(table["dataset"])]
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
         if not sources_of_gate(source, str(target), present):
-            continue  # a study of some datasets has the gates that these allow
+            continue  # a study without all datasets has fewer gates
         layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
         items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
         decision = decide(items, source, str(target), **about)
@@ -175,7 +177,7 @@ def _decisions(
 
 
 def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
-    """Return the table with its features; with shuffled labels, where a coin for each scenario swaps its sides."""
+    """Return the table with its features; if shuffled, with a scenario's sides swapped with probability 0.5."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, of in features.items():
         values[(table["dataset"] == name).to_numpy()] = of
@@ -186,8 +188,11 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
 
 
 def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
-    """Return outcomes by dataset, in the order of the states; None if the four datasets that have states have no
-    verdicts. Items without verdicts (those that no model is asked) have undecided ones."""
+    """Return outcomes by dataset, in the order of the states.
+
+    None if the four datasets that have states have no verdicts. Items without verdicts (those that no model is asked)
+    are undecided.
+    """
     outcomes: dict[str, Outcomes] = {}
     judged = False
     for dataset in dict.fromkeys(states.items["dataset"]):
@@ -274,7 +279,7 @@ def _row(
     return GateRow(
         **states.extraction.partition,
         **named,
-        **nulled(figures),
+        **nan_to_null(figures),
         layer=layer,
         n_controls=sides[0],
         n_voids=sides[1],
@@ -288,8 +293,10 @@ def _curves(
     decided: Made,
     outcomes: Mapping[str, Outcomes],
 ) -> list[RiskCoverageRow]:
-    """Return risk against coverage over the four datasets together; a score counts from its own gate's mid threshold,
-    so that the scores of four gates are comparable."""
+    """Return risk against coverage over the four datasets together.
+
+    A score is relative to its own gate's mid threshold, so that the scores of four gates are comparable.
+    """
     own = [name for name in decided if name in DATASETS]
     if not own:
         return []

@@ -33,7 +33,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
-from traps_pipeline.storage.leases import alone, leased
+from traps_pipeline.storage.leases import alone, leased_ranges
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 from traps_pipeline.storage.store import FolderStore
@@ -45,19 +45,21 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt, States
 
 SHARD_SIZE = 64  # items of a chunk and its shard: 20 MB at the 8B size; a kill loses one shard at most
-PREPARED_AHEAD = 2  # prompts that are decoded while the model works
+PREPARED_AHEAD = 2  # prompts prepared while the model works
 NORMED = "normed"
 _IDS = "ids.parquet"
-_WRITING = "shards"  # the lease of whoever writes into a folder
+_WRITING = "shards"  # lease of the process that writes into a folder
 _RECORD = b"traps"
 _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
 
 
 @dataclass(frozen=True)
 class Item:
-    """One forward pass to make. about: everything that the states depend on (question, clips, system prompt), for the
-    key. prompt: makes the prompt, and is called only when the states are missing; other: the same about the pair's
-    other clip, for poolings over what differs."""
+    """One forward pass to run. about: everything that the states depend on, for the key.
+
+    prompt: builds the prompt, called only if the states are missing; other: the same for the pair's other clip, for
+    poolings over differences.
+    """
 
     item_id: str
     side: str
@@ -76,9 +78,9 @@ def clip_item(
 ) -> Item:  # fmt: skip
     """Return the item that asks a question about a clip under a system prompt.
 
-    row: a row of the items table (item_id, side, question, media_digest; times_digest where there is `times`). spec:
-    how the model is shown a clip. times: another clip, whose frame times are shown in the place of the clip's own.
-    other: the pair's other clip and its SHA-256, where the pooling depends on it.
+    row: a row of the items table (item_id, side, question, media_digest; times_digest if `times` is given). spec: how
+    the model is shown a clip. times: another clip, whose frame times replace the clip's own. other: the pair's other
+    clip and its SHA-256, if the pooling depends on it.
     """
 
     def asked(frames_of: Path) -> Prompt:
@@ -93,8 +95,7 @@ def clip_item(
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
-    """Return the times (N,) in seconds that stand beside a clip's shown frames: its own, or those of another clip,
-    spread over as many frames if the other one has more or fewer."""
+    """Return the times (N,) in seconds beside a clip's frames: its own, or another clip's, spread over as many."""
     if times is None or times == clip:
         return shown.times_s
     other = sample(times, spec).times_s
@@ -104,7 +105,7 @@ def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) 
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
-    """Return the digest of all that an item's states depend on: prompt, checkpoint, precision, pooling."""
+    """Return the digest of all inputs of an item's states: prompt, checkpoint, precision, pooling."""
     return digest({"about": dict(item.about), "model": model.identity, "pooling": pooling})
 
 
@@ -120,19 +121,19 @@ def extract(
     """Make the missing states of the items, one prompt per pass, then write the current row of each item; returns how
     many were made.
 
-    Several processes may work at one folder: each takes chunks of `shard_size` items that no other one has. If one ends
-    early (Ctrl-C, an error, a kill), the states made so far are written, but for the chunk that a kill interrupts, and
-    the others or the same call continue there. what: names the items in the progress line. Raises TrapsError when the
-    disk cannot be written.
+    Several processes may work at one folder: each takes free chunks of `shard_size` items. If one ends early (Ctrl-C,
+    an error, a kill), the states made so far are written, except for the chunk that a kill interrupts, and the others
+    or the same call continue there. what: names the items in the progress line. Raises TrapsError if the disk cannot be
+    written.
     """
     keys = [states_key(model, item, pooling) for item in items]
     known, count, here = dict[str, _Place](), 0, FolderStore(folder)
     with alone(here, _WRITING):
         _look_for(folder, known)
     total = sum(key not in known for key in keys)
-    for chunk in leased(here, "chunks", len(items), shard_size):
+    for chunk in leased_ranges(here, "chunks", len(items), shard_size):
         if any(keys[n] not in known for n in chunk):
-            _look_for(folder, known)  # another process may have had this chunk
+            _look_for(folder, known)  # another process may have made this chunk
         missing = [(items[n], keys[n]) for n in chunk if keys[n] not in known]
         if missing:
             tick = partial(_tick, what, count, total)
@@ -149,7 +150,7 @@ def _tick(what: str, before: int, total: int, done: int) -> None:
 
 
 def _look_for(folder: Path, known: dict[str, _Place]) -> None:
-    """Add what is in shards that were not looked at."""
+    """Add the contents of new shards."""
     names = {shard for shard, _, _ in known.values()}
     for shard, table in _shards(folder, names):
         for row, (key, device) in enumerate(zip(table["key"], table["device"], strict=True)):
@@ -176,10 +177,9 @@ def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFra
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return the model and settings of an extraction: checkpoint and digest, class, precision, pooling, n_layers,
-    d_model.
+    """Return model and settings of an extraction: checkpoint, digest, class, precision, pooling, n_layers, d_model.
 
-    Raises TrapsError for an extraction that is not finished.
+    Raises TrapsError for an unfinished extraction.
     """
     return _ids(folder)[1]
 
@@ -195,7 +195,7 @@ def _make(
     tick: Callable[[int], None],
     known: dict[str, _Place],
 ) -> int:
-    """Make one pass per item, and a shard of them all, of what there is also after an error or Ctrl-C; their number."""
+    """Run one pass per item and write a shard, also after an error or Ctrl-C; return the number of finished items."""
     shard: list[_Made] = []
     try:
         for done, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
@@ -210,13 +210,12 @@ def _make(
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
     """Return the states of an item, pooled over the tokens that the pooling names."""
     chosen = _chosen(model, prompt, item, pooling)
-    with model.remembering_clips():
+    with model.caching_clips():
         return model.forward_states(prompt, pooling, chosen=chosen)
 
 
 def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
-    """Return the tokens over which states are pooled; None where the pooling says so itself. Raises TrapsError for a
-    part that the prompt does not have (a model that writes no time stamps, a pair with equal clips)."""
+    """Return the tokens over which states are pooled; None if the pooling needs no mask. Raises TrapsError if none."""
     if pooling not in OF_PARTS:
         return None
     parts = spans(model, prompt, item.about["system"], item.about["question"])
@@ -239,7 +238,7 @@ def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.nda
 
 
 def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
-    """Yield items with their prompts; the next ones are decoded while the model works."""
+    """Yield items with their prompts, preparing the next ones while the model works."""
     with ThreadPoolExecutor(1) as pool:
         waiting: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
         try:
@@ -257,7 +256,7 @@ def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item,
 
 
 def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Pooling, known: dict[str, _Place]) -> None:
-    """Write a shard under the next free number, tensors first, and note where its items are."""
+    """Write a shard under the next free number, tensors first, and record the place of its items."""
     if not shard:
         return
     import pyarrow as pa
@@ -279,8 +278,7 @@ def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Poo
 
 
 def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield the complete shards but those seen: name and table. Tensors without a table come from a killed run;
-    `_sweep` removes them."""
+    """Yield name and table of the complete shards not in `seen`; `_sweep` removes tensors without a table."""
     for path in sorted(path for path in folder.glob("shard-*.parquet") if path.stem not in seen):
         try:
             table = read_sealed(path).to_pandas()
@@ -345,7 +343,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
 
 
 def _sound_rows(file: Path) -> int:
-    """Return how many items a shard holds. Raises TrapsError unless every tensor of it is what was written."""
+    """Return how many items a shard holds. Raises TrapsError if a tensor is damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -375,7 +373,7 @@ def _seal_of(tensor: torch.Tensor) -> str:
 
 
 def _sweep(folder: Path, needed: set[str]) -> None:
-    """Remove the shards that hold no current row of any item."""
+    """Remove the shards without any current row."""
     for path in folder.glob("shard-*"):
         if path.name.split(".")[0] not in needed:
             path.unlink()

@@ -30,7 +30,7 @@ _PARTS: dict[Site, str] = {"attention": "self_attn", "mlp": "mlp"}
 
 
 def changing(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> RemovableHandle:
-    """Register a hook that puts `change` of a site's states (rows, T, d) in their place.
+    """Register a hook that replaces a site's states (rows, T, d) by `change` of them.
 
     It runs before all others, so that hooks that record states record the changed ones. Raises TrapsError for a block
     without such a part.
@@ -50,8 +50,8 @@ def changing(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> R
 class Steering:
     """A direction at a layer, and its strength for each row of a batch.
 
-    direction: (d_model,) float32 for all rows, or (rows, d_model) with one of its own for each; used without scaling
-    (void directions are unit vectors). layer: counted as in hidden_states, 1 to n_layers. alphas: one per row, signed.
+    direction: (d_model,) float32 for all rows, or (rows, d_model) with one per row; used without scaling (void
+    directions are unit vectors). layer: counted as in hidden_states, 1 to n_layers. alphas: one per row, signed.
     """
 
     direction: np.ndarray
@@ -59,16 +59,16 @@ class Steering:
     alphas: tuple[float, ...]
 
     def rows(self, chosen: Sequence[int]) -> Steering:
-        """Return the steering of some of the rows."""
+        """Return the steering of the selected rows."""
         direction = self.direction if self.direction.ndim == 1 else self.direction[list(chosen)]
         return replace(self, direction=direction, alphas=tuple(self.alphas[i] for i in chosen))
 
     @contextmanager
     def applied(self, model: LocalModel) -> Iterator[None]:
-        """Steer the passes that are made inside the context; the hook is always removed at its end.
+        """Steer the model's passes inside the context; the hook is always removed at its end.
 
-        Where every alpha is 0 there is no hook, and outputs equal the unsteered model's bit for bit. Raises TrapsError
-        for a layer that the model lacks, and for a direction of another width or with values that are not finite.
+        If every alpha is 0 there is no hook, and outputs equal the unsteered model's bit for bit. Raises TrapsError for
+        a layer that the model lacks, and for a direction of another width or with values that are not finite.
         """
         import torch
 

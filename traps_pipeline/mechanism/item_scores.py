@@ -1,7 +1,7 @@
-"""What a model's states and its output say of each item, beside its verdict: encoded, and expressed or not.
+"""Compare a model's states and its output item by item, beside its verdict: encoded, and expressed or not.
 
-Every score of states is of a probe that was not fitted on the item's scenario, at the layer that is chosen without the
-item's dataset, counted from the probe's own mid threshold (half-way between the sides' means).
+Every score of states comes from a probe that was fitted without the item's scenario, at the layer chosen without the
+item's dataset, relative to the probe's own mid threshold (half-way between the sides' means).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from traps_pipeline.mechanism.baselines import NoMargin, output_margins
 from traps_pipeline.mechanism.control_rows import ItemScoreRow
 from traps_pipeline.mechanism.gate import MID, OTHER_DATASETS, decide, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table, outcomes_of, read_states
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING

@@ -1,10 +1,10 @@
-"""The layer at which a dataset is read when its own labels are not known, from rows of PROBES.
+"""Choose the layer of a dataset without its own labels, from rows of PROBES.
 
-A probe's cross-validation on its own dataset chooses nothing: it reaches 1 early and stays there (the paper: from layer
-1), so its maximum is the lowest of many ties. Layers differ in whether a probe carries over to other datasets. So a
-target is read at the layer where the probes of the *other* datasets carry over best to each other: no pair with the
-target on either side counts, so no label of its voids does. Its controls are those of its taxonomy's other dataset too;
-pairs of one taxonomy count as fitted without the scored scenario (`held_out`).
+A probe's cross-validation on its own dataset cannot choose: it reaches 1 early and stays there (the paper: from layer
+1), so its maximum is the lowest of many ties. Layers differ in whether a probe transfers to other datasets. So a target
+is read at the layer where the probes of the *other* datasets transfer best to each other: no pair with the target on
+either side counts, so no label of its voids does. Its controls are those of its taxonomy's other dataset too; pairs of
+one taxonomy count as fitted without the scored scenario (`held_out`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from traps_pipeline.protocol.datasets import DATASETS, TIME_SWAPPED, taxonomy_of
 
 Curves = Mapping[tuple[str, str], Mapping[int, float]]
 ROUNDING = 1e-9
-LOOKS_LIKE = {**LOOK_ALIKES, TIME_SWAPPED: "chaotic"}  # without labels of their own: read as the dataset they look like
+LOOKS_LIKE = {**LOOK_ALIKES, TIME_SWAPPED: "chaotic"}  # use the layer of the dataset that they resemble
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,10 @@ class LayerChoice:
 
 
 def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
-    """Return AUROC by ordered pair of datasets (one on itself among them) and layer, from PROBES rows: pairs of one
-    taxonomy without the scored scenario."""
+    """Return AUROC by layer and ordered pair of datasets (also a dataset on itself), from PROBES rows.
+
+    Pairs of one taxonomy are scored without the scored scenario in the fit.
+    """
     curves: dict[tuple[str, str], dict[int, float]] = {}
     for row in rows:
         pair, value = (str(row["source"]), str(row["target"])), row["value"]
@@ -58,7 +60,7 @@ def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 
 
 def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
-    """Choose the layer of a target: a dataset, what looks like one, or (empty) anything else.
+    """Choose the layer of a target: a dataset, a look-alike of one, or (empty) anything else.
 
     In a study with fewer than three datasets no pair is left: then the other dataset's own held-out figure counts,
     which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any figure.

@@ -1,7 +1,7 @@
-"""The output margin by layer: what a state would make the model say if it were the last one (logit lens).
+"""The output margin by layer: a logit lens on stored states.
 
-No pass is made: the stored states go through the model's own final norm and head. At the last layer it is the output
-margin itself. The curve shows at which layer a prompt decides whether a void is answered.
+Without any pass, the stored states go through the model's own final norm and head. At the last layer the result is the
+output margin itself. The curve shows at which layer a prompt decides whether a void is answered.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from traps_pipeline.mechanism.baselines import NoMargin, margin_tokens
 from traps_pipeline.mechanism.control_rows import LensRow
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.mechanism.probes import auroc, auroc_interval
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import scenario_weights
@@ -27,8 +27,11 @@ if TYPE_CHECKING:
 
 
 def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[LensRow]:
-    """Return the rows of LENS of an extraction: every dataset of pairs at every layer. There are none where states are
-    means over tokens, or where the vocabulary has no token that begins an abstention; a note says so."""
+    """Return the rows of LENS of an extraction: every dataset of pairs at every layer.
+
+    There are none if states are means over tokens, or if no token of the vocabulary begins an abstention; a note says
+    so.
+    """
     try:
         model, tokens = margin_tokens(entry, states)
     except NoMargin as error:
@@ -60,7 +63,7 @@ def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def layer_margins(model: LocalModel, states: Any, tokens: list[int]) -> np.ndarray:
-    """Return the margins (n,) of states (n, d) as they leave a block, through the final norm and the head."""
+    """Return the margins (n,) of a block's output states (n, d), through the final norm and the head."""
     import torch
 
     with torch.inference_mode():

@@ -1,7 +1,7 @@
-"""The output margin: how much more likely a model is to begin an answer by abstaining than in any other way.
+"""The output margin: the log-odds that a model's answer begins with an abstention.
 
-It is read off the first answer token: the log-odds of the tokens with which an abstention begins against all others.
-A probe says something about a gap between representation and output only as far as it separates better than this.
+It is computed from the first answer token: the log-odds of the tokens that begin an abstention against all others. A
+probe says something about a gap between representation and output only as far as it separates better than this.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ if TYPE_CHECKING:
 
     from traps_pipeline.models.local.adapter import LocalModel
 
-# How an abstention begins. "I don't know" is what the guided prompt asks for (assets/prompts).
+# Beginnings of an abstention. The guided prompt asks for "I don't know" (assets/prompts).
 PHRASES = ("i don't know", "i do not know", "i cannot", "i can't", "cannot", "unable", "unanswerable", "unknown")
 _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
 def begins_abstention(token: str) -> bool:
-    """Return whether a token's text begins an abstention: a whole phrase of PHRASES with whatever follows it, or the
-    first word of one. "I" counts, although other sentences begin with it too: the margin is a lower bound of what the
-    first token says."""
+    """Return whether a token's text begins an abstention: with a phrase of PHRASES, or the first word of one.
+
+    "I" counts, although other sentences begin with it too: the margin is a lower bound of the information in the first
+    token.
+    """
     text = token.strip().lower().replace("\u2019", "'")
     return text in _FIRST_WORDS or text.startswith(PHRASES)
 
 
 def abstention_tokens(model: LocalModel) -> list[int]:
-    """Return the tokens of a model's vocabulary with which an abstention begins. Raises TrapsError if there is none."""
+    """Return the tokens of a model's vocabulary that begin an abstention. Raises TrapsError if there is none."""
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
     tokens = [token for token, text in enumerate(texts) if begins_abstention(text)]
@@ -45,7 +47,7 @@ def abstention_tokens(model: LocalModel) -> list[int]:
 
 
 def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
-    """Return log-odds of `tokens` against all others but `never`, from logits (.., vocabulary): (..)."""
+    """Return the log-odds of `tokens` against all others except `never`, from logits (.., vocabulary): (..)."""
     import torch
 
     chosen = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
@@ -58,9 +60,9 @@ def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) 
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
-    """Return the margins (n,) of states (n, d) that left the final norm at the last position of a prompt, on the CPU.
+    """Return the margins (n,) of normed states (n, d) at a prompt's last position, on the CPU.
 
-    Gradients pass: `patching_effects.attributed_changes` asks for them.
+    Gradients pass: `patching_effects.attributed_changes` needs them.
     """
     import torch
 
@@ -70,7 +72,7 @@ def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -
 
 
 def head_logits(model: LocalModel, normed: Tensor) -> Tensor:
-    """Return the logits (n, vocabulary) float32 of states (n, d) that left the final norm."""
+    """Return the logits (n, vocabulary) float32 of normed states (n, d)."""
     import torch
 
     head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()

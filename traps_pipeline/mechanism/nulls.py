@@ -1,8 +1,7 @@
-"""Steering beside its controls, from STEERING_EFFECTS rows: the void direction's effect ranked among nulls, and PECS
-under each sign policy.
+"""Rank steering effects among nulls, and compute PECS under each sign policy, from STEERING_EFFECTS rows.
 
-The paper adds a direction on controls and subtracts it on voids, which nobody can do who does not know the sides. So
-PECS is also given where the same is added, or subtracted, on both sides.
+The paper adds a direction on controls and subtracts it on voids, which requires knowing the sides. So PECS is also
+given for adding, or subtracting, on both sides.
 """
 
 from __future__ import annotations
@@ -23,8 +22,10 @@ _AT = [*_CELL, "layer", "unit", "dose", "side"]
 
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
-    """Return rows of STEERING_NULLS: every dataset along its own direction, and the mean over datasets. Without nulls
-    there are no rows."""
+    """Return rows of STEERING_NULLS: every dataset along its own direction, and the mean over datasets.
+
+    Without nulls there are no rows.
+    """
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     moved = _moved(own)
     nulls = moved.loc[moved["kind"].isin(NULLS)]
@@ -36,8 +37,10 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
 
 
 def _moved(own: pd.DataFrame) -> pd.DataFrame:
-    """Return steered effects with `moved`, the change against the unsteered answers in the direction that is claimed:
-    more abstention on controls, less on voids."""
+    """Return steered effects with `moved`, the change against the unsteered answers in the claimed direction.
+
+    That is more abstention on controls, and less on voids.
+    """
     path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
     plain = own.loc[own["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
     steered = own.loc[own["dose"] != 0].merge(plain, on=path)
@@ -52,7 +55,7 @@ def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
         for null in NULLS:
             draws = group.loc[group["kind"] == null].groupby("draw")
             here = void.loc[void["target"].isin(set(group.loc[group["kind"] == null, "target"]))]
-            values = draws["moved"].mean().dropna().to_numpy(float)  # without draws on which no answer was decided
+            values = draws["moved"].mean().dropna().to_numpy(float)  # leave out draws without a decided answer
             if not len(values) or here["moved"].isna().any() or here.empty:
                 continue
             effect = float(here["moved"].mean())
@@ -74,20 +77,22 @@ def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
             )
 
 
-def nulled(figures: Mapping[str, float]) -> dict[str, Any]:
-    """Return the figures with null in the place of NaN, as tables have them."""
+def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
+    """Return the figures with null instead of NaN, as in tables."""
     return {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
-    """Return rows of STEERING_PECS: every path, dose and sign policy of the void directions that was steered on both
-    sides. Figures without a decided answer are null."""
+    """Return rows of STEERING_PECS: every path, dose and sign policy of void directions with both sides steered.
+
+    Figures without a decided answer are null.
+    """
     keys = [*_CELL, "source", "target", "layer", "unit", "dose", "signs"]
     rows: list[SteeringPecsRow] = []
     for key, group in effects.loc[effects["kind"] == VOID].groupby(keys, sort=True):
         sides = {str(row["side"]): row for row in group.to_dict("records")}
         if len(sides) < 2:
-            continue  # a layer of the sweep, which has controls alone
+            continue  # a layer of the sweep, which has only controls
         control, void = sides["control"], sides["void"]
         acc = control["correct"] / control["n_correct"] if control["n_correct"] else np.nan
         false_abs, abs_rec = (row["abstained"] / row["n"] if row["n"] else np.nan for row in (control, void))
@@ -98,7 +103,7 @@ def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
         rows.append(
             SteeringPecsRow(
                 **dict(zip(keys, key if isinstance(key, tuple) else (key,), strict=True)),
-                **nulled(figures),
+                **nan_to_null(figures),
                 degenerate=(control["degenerate"] + void["degenerate"]) / answers,
                 n_controls=int(control["n"]),
                 n_voids=int(void["n"]),

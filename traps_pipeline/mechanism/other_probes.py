@@ -1,4 +1,4 @@
-"""Probes besides the regression of the protocol, for `traps_pipeline.inside.protocol`, and the erasure of a concept."""
+"""Alternative probes for `traps_pipeline.inside.protocol`, and the erasure of a concept."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, standardiser
 
 
 def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
-    """Return the probe whose weights are the difference of the sides' standardised means; 0 lies half-way between
-    them.
+    """Return the probe whose weights are the difference of the sides' standardised means.
+
+    A score of 0 lies half-way between them.
     """
     mean, scale = standardiser(np.asarray(states, float))
     standard = (states - mean) / scale
@@ -23,8 +24,10 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
 
 
 def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """Return a probe of any scikit-learn classifier or pipeline; make: returns a new one. Scores are its decision
-    function, or the log-odds of its probabilities."""
+    """Return a fit function for any scikit-learn classifier or pipeline; make: returns a new one.
+
+    Scores are its decision function, or the log-odds of its probabilities.
+    """
 
     def fit(states: np.ndarray, void: np.ndarray) -> Scorer:
         return _Estimator(make().fit(states, void))

@@ -39,7 +39,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.models.local.capture import first_tensor
-from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, given, giving, unknown_path
+from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, argument_of, unknown_path, with_argument
 from traps_pipeline.models.local.spans import visual_tokens
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 SITES: tuple[Site, ...] = ("residual", "attention", "mlp")
-ROWS, TOKENS = 64, 2**14  # patches in one pass: at most so many, and fewer of long prompts
+ROWS, TOKENS = 64, 2**14  # maximum number of patches in one pass; fewer for long prompts
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +62,13 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """The decoder's part of a pass.
+class RecordedPass:
+    """The recorded decoder part of a pass.
 
-    inputs: what the decoder was called with, after the vision tower. states: by site and layer, (T, d); the residual
-    stream always, other sites as asked for. margin: the outcome. pictures: which tokens are visual, (T,) bool.
-    per_layer: what each block was given of the token's own, (T, width), empty for a model without that. shared: by
-    name, the layer that made keys and values which later blocks read, and these, (1, heads, T, width).
+    inputs: the decoder's arguments, after the vision tower. states: by site and layer, (T, d); always the residual
+    stream, other sites on request. margin: the outcome. pictures: which tokens are visual, (T,) bool. per_layer: each
+    block's per-token input vector, (T, width), empty for a model without it. shared: by name, the layer whose keys and
+    values later blocks read, and these, (1, heads, T, width).
     """
 
     inputs: Mapping[str, Any]
@@ -80,18 +80,18 @@ class Recorded:
 
     @property
     def length(self) -> int:
-        """Tokens."""
+        """The number of tokens."""
         return int(self.inputs["inputs_embeds"].shape[1])
 
     @property
     def visual(self) -> np.ndarray | None:
-        """Where deepstack features are added, (T,) bool; None for a model that has none."""
+        """The positions that deepstack features are added at, (T,) bool; None for a model without any."""
         mask = self.inputs.get("visual_pos_masks")
         return None if mask is None else mask[0].cpu().numpy()
 
 
 def require_patchable(model: LocalModel) -> None:
-    """Raise TrapsError for a model whose later blocks read more of earlier ones than is replaced here."""
+    """Raise TrapsError for a model whose later blocks read more of earlier ones than this module replaces."""
     unknown = unknown_path(model.network.config.get_text_config(), model.blocks[0])
     if unknown:
         raise TrapsError(
@@ -116,10 +116,10 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
             yield site, layer, part
 
 
-def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> Recorded:
-    """Run one pass and keep what a patch may take from it, at the residual stream and at `sites`.
+def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
+    """Run one pass and keep what a patch may need, at the residual stream and at `sites`.
 
-    tokens: those that begin an abstention. Raises TrapsError for a block that hands on more than the residual stream.
+    tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
     """
     import torch
 
@@ -140,12 +140,12 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
         states[site, layer] = first_tensor(output)[0].clone()
 
     def keep_own(block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        own = given(block, PER_LAYER, args, kwargs)
+        own = argument_of(block, PER_LAYER, args, kwargs)
         if own is not None:
             per_layer.append(own[0])
 
     def keep_shared(layer: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any], _: Any) -> None:
-        for name, (keys, values) in (given(block, SHARED, args, kwargs) or {}).items():
+        for name, (keys, values) in (argument_of(block, SHARED, args, kwargs) or {}).items():
             if name not in shared or shared[name][1] is not keys:
                 shared[name] = layer, keys, values
 
@@ -158,22 +158,22 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
         for layer, block in enumerate(model.blocks, start=1):
             hooks.callback(block.register_forward_pre_hook(keep_own, with_kwargs=True).remove)
             hooks.callback(block.register_forward_hook(partial(keep_shared, layer), with_kwargs=True).remove)
-        hooks.enter_context(model.remembering_clips())
+        hooks.enter_context(model.caching_clips())
         last = model.forward(prompt).last_hidden_state[:, -1]
         states["residual", 0] = inputs["inputs_embeds"][0].clone()
         margin = float(first_token_margins(model, last, tokens)[0])
-        return Recorded(inputs, states, margin, visual_tokens(model, prompt), tuple(per_layer), shared)
+        return RecordedPass(inputs, states, margin, visual_tokens(model, prompt), tuple(per_layer), shared)
 
 
 def patched_changes(
-    model: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], tokens: Sequence[int]
+    model: LocalModel, target: RecordedPass, source: RecordedPass, patches: Sequence[Patch], tokens: Sequence[int]
 ) -> np.ndarray:
     """Measure the change of the target's outcome by each patch from the source, (patches,).
 
     Passes begin at the lowest patched block of their rows; the vision tower is not run again. Every pass has one row
-    without a patch, and changes are against that row: a patch that replaces states by equal ones changes nothing, bit
-    for bit, whatever the size of the batch does to rounding. Raises TrapsError when the two prompts have another number
-    of tokens, or other visual positions.
+    without a patch, and changes are relative to that row: a patch that replaces states by equal ones changes nothing,
+    bit for bit, whatever the batch size does to rounding. Raises TrapsError if the two prompts have different numbers
+    of tokens, or different visual positions.
     """
     import torch
 
@@ -190,7 +190,7 @@ def patched_changes(
 
 
 def attributed_changes(
-    model: LocalModel, target: Recorded, source: Recorded, tokens: Sequence[int]
+    model: LocalModel, target: RecordedPass, source: RecordedPass, tokens: Sequence[int]
 ) -> dict[tuple[Site, int], np.ndarray]:
     """Estimate the change of the target's outcome by patching each token alone, (T,) by recorded site and layer.
 
@@ -218,7 +218,7 @@ def attributed_changes(
 Weights = Mapping[tuple[Site, int], "Tensor"]
 
 
-def _require_one_form(target: Recorded, source: Recorded) -> None:
+def _require_one_form(target: RecordedPass, source: RecordedPass) -> None:
     if not np.array_equal(target.pictures, source.pictures):
         raise TrapsError(
             f"a prompt of {source.length} tokens cannot be patched into one of {target.length}, or their visual tokens "
@@ -227,15 +227,14 @@ def _require_one_form(target: Recorded, source: Recorded) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """Return the layer whose recorded state a patched pass can begin with. Raises TrapsError for a site that is not
-    there."""
+    """Return the layer whose recorded state a patched pass can start from. Raises TrapsError for an unknown site."""
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1
 
 
 def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
-    """Return the weights of a pass with one row for each patch behind a row without any."""
+    """Return the weights of a pass: one row without a patch, then one row per patch."""
     import torch
 
     masks: dict[tuple[Site, int], Tensor] = {}
@@ -246,15 +245,13 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
 
 def _behind(weights: Weights, layer: int) -> Tensor | None:
-    """Return the weights of residual patches at a layer or below it, which are all behind them."""
+    """Return the weights of residual patches up to a layer, which affect all later layers."""
     parts = [part for (site, at), part in weights.items() if site == "residual" and at <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
 def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
-    """Return states (rows, .., T, d), of which the source's, (T, d) or (1, .., T, d), take the part that weights
-    say.
-    """
+    """Return states (rows, .., T, d), mixed with the source's, (T, d) or (1, .., T, d), by weights."""
     import torch
 
     weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
@@ -264,14 +261,14 @@ def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
 
 def _margins(
     model: LocalModel,
-    target: Recorded,
-    source: Recorded,
+    target: RecordedPass,
+    source: RecordedPass,
     weights: Weights,
     start: int,
     rows: int,
     tokens: Sequence[int],
 ) -> Tensor:
-    """Return the outcomes (rows,) of a pass over so many copies of the target, from the state at layer `start` on."""
+    """Return the outcomes (rows,) of a pass over several copies of the target, from the state at layer `start` on."""
     inputs = _repeated(target, rows)
     if ("residual", 0) in weights:
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
@@ -286,8 +283,8 @@ def _margins(
     return first_token_margins(model, last, tokens)
 
 
-def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
-    """Return the decoder's inputs for so many rows of one prompt."""
+def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
+    """Return the decoder's inputs for several rows of one prompt."""
     import torch
 
     length, inputs = target.length, dict(target.inputs)
@@ -303,9 +300,9 @@ def _repeated(target: Recorded, rows: int) -> dict[str, Any]:
 
 @contextmanager
 def _replacing(
-    model: LocalModel, target: Recorded, source: Recorded, weights: Weights, start: int, rows: int
+    model: LocalModel, target: RecordedPass, source: RecordedPass, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
-    """Let passes begin behind block `start` and take what weights say from the source; all is undone at the end."""
+    """Let passes start behind block `start` and replace states by the source's; undo everything at the end."""
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
         states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])
@@ -318,10 +315,10 @@ def _replacing(
         """Return the arguments of the block above `below` others, with the source's where the stream below was
         patched.
         """
-        own, behind = given(block, PER_LAYER, args, kwargs), _behind(weights, below)
+        own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
         if own is not None and behind is not None:
-            args, kwargs = giving(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
-        shared = given(block, SHARED, args, kwargs)  # one mapping, which all blocks are given
+            args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
+        shared = argument_of(block, SHARED, args, kwargs)  # one mapping, shared by all blocks
         if shared is not None and below == start:
             for name, (maker, *pair) in target.shared.items():
                 if maker <= start:
@@ -340,7 +337,7 @@ def _replacing(
         for below, block in enumerate(blocks[start:], start=start):
             hooks.callback(block.register_forward_pre_hook(partial(beside, below), with_kwargs=True).remove)
         for layer, block in enumerate(blocks[:start], start=1):
-            own = vars(block).get("forward")  # of a model that accelerate spreads over devices
+            own = vars(block).get("forward")  # set by accelerate on a model that is spread over devices
             block.forward = partial(skip, layer)
             hooks.callback(
                 partial(vars(block).pop, "forward") if own is None else partial(setattr, block, "forward", own)

@@ -1,5 +1,4 @@
-"""The clips and questions for which hidden states are extracted: the pairs, and what settles whether a probe reads a
-shortcut."""
+"""The clips and questions for which hidden states are extracted: pairs, and controls for shortcuts of probes."""
 
 from __future__ import annotations
 
@@ -21,8 +20,11 @@ COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "questio
 
 
 def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
-    """Return rows of a dataset's probe_items: those of items; occlusion's void clips with the answerable question; or
-    chaotic's clips with the frame times of the other side."""
+    """Return rows of a dataset's probe_items.
+
+    These are the dataset's items; occlusion's void clips with the answerable question; or chaotic's clips with the
+    frame times of the other side.
+    """
     if dataset == TIME_SWAPPED:
         return time_swapped(workspace.tables.read(ITEMS, {"dataset": "chaotic"}))
     if dataset != ANSWERABLE:
@@ -47,11 +49,11 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
 
 
 def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]:
-    """Return the clip with which a row of PROBE_ITEMS is compared, and its SHA-256: of its scenario's two clips that of
-    the other side, whichever question the row has, and for any other clip (an arm's) the control's.
+    """Return the clip that a row of PROBE_ITEMS is compared with, and its SHA-256.
 
-    So an ill-posed row, whose two sides have one clip, is compared where the scenario's panel would be. Raises
-    TrapsError for a scenario without both clips.
+    It is the clip of the other side of the scenario, whichever question the row has, and for any other clip (an arm's)
+    the control's. So an ill-posed row, whose two sides have one clip, is compared at the position of the scenario's
+    occluder. Raises TrapsError for a scenario without both clips.
     """
     clips = workspace.tables.read(VIDEOS, {"category": row["category"]})
     sides = clips.loc[clips["scenario_id"] == row["scenario_id"]].set_index("side")
@@ -62,7 +64,7 @@ def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
-    """Return the void clip with a question that it answers; its side is control, since it must be answered."""
+    """Return the void clip with an answerable question; its side is control, since it must be answered."""
     pair = f"{ANSWERABLE}:{spec['scenario_id']}"
     return ProbeItemRow(
         **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
@@ -79,9 +81,11 @@ def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeI
 
 
 def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
-    """Return both sides of chaotic's pairs with the frame times of the other side, from ITEMS rows of chaotic: a probe
-    that reads time stamps takes a control for a void and a void for a control. A scenario without both sides is left
-    out."""
+    """Return both sides of chaotic's pairs with the frame times of the other side, from ITEMS rows of chaotic.
+
+    A probe that reads time stamps takes a control for a void and a void for a control. A scenario without both sides is
+    left out.
+    """
     rows: list[ProbeItemRow] = []
     for _, pair in items.groupby("scenario_id", sort=True):
         sides = {str(row["side"]): row for row in pair.to_dict("records")}

@@ -26,7 +26,7 @@ class Split:
     scenario: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Split:
-        """Return the chosen items; chosen is a mask or indices."""
+        """Return the selected items; chosen is a mask or indices."""
         return Split(self.states[chosen], self.void[chosen], self.scenario[chosen])
 
 
@@ -46,7 +46,7 @@ class Probe:
 
 
 class Scorer(Protocol):
-    """What is fitted: anything that scores states, higher for void."""
+    """A fitted scorer of states, higher for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
         """Return scores (n,) of states (n, d)."""
@@ -59,8 +59,10 @@ Fit = Callable[[np.ndarray, np.ndarray], Scorer]  # states (n, d), void (n,) boo
 
 
 def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and population standard deviation of each column, (d,) each. As in scikit-learn's StandardScaler the
-    deviation is 1 where a column is constant up to rounding."""
+    """Return mean and population standard deviation of each column, (d,) each.
+
+    As in scikit-learn's StandardScaler the deviation is 1 for a column that is constant up to rounding.
+    """
     mean, variance = states.mean(axis=0), states.var(axis=0)
     rounding = len(states) * np.finfo(float).eps
     constant = variance <= rounding * variance + (rounding * mean) ** 2
@@ -164,9 +166,9 @@ def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np
 
 
 def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,). Ties count half.
+    """Return the area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,).
 
-    By mean ranks (Mann and Whitney). NaN where one class has no item.
+    Ties count half, by mean ranks (Mann and Whitney). NaN if one class has no item.
     """
     from scipy.stats import rankdata
 
@@ -181,12 +183,12 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Return percentile interval of the AUROC from resampled scenarios, with the probe held fixed, and with a floor:
-    where all resamples agree (a probe that separates 16 pairs), percentiles would say that the value is certain.
+    """Return the percentile interval of the AUROC from resampled scenarios, with a minimum width.
 
-    The floor is the exact binomial one. If a share s of n scenarios fails, none of them fails with probability
-    (1 - s)^n; so with n scenarios of the scarcer side, an interval reaches down to at least ((1 - level) / 2)^(1/n),
-    which is .79 for 16, and up to at least 1 minus that.
+    The probe is held fixed. If all resamples agree (a probe that separates 16 pairs), percentiles alone would claim
+    certainty, so the exact binomial bound is the minimum: if a share s of n scenarios fails, none of them fails with
+    probability (1 - s)^n; so with n scenarios of the scarcer side, an interval reaches down to at least ((1 - level) /
+    2)^(1/n), which is .79 for 16, and up to at least 1 minus that.
 
     weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,), the
     column of `weights` for each item. A resample in which a class is empty is dropped.
@@ -208,9 +210,9 @@ def auroc_interval(
 
 
 def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """Return the fold of each item, (n,) int: items of a scenario share one, and folds differ by one scenario at most.
+    """Return the fold of each item, (n,) int: a scenario's items share one; fold sizes differ by at most one scenario.
 
-    Raises TrapsError when there are fewer scenarios than folds.
+    Raises TrapsError if there are fewer scenarios than folds.
     """
     names = np.unique(scenario)
     if len(names) < folds:
@@ -254,8 +256,10 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndar
 
 
 def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
-    """Return whether each of states (n, d) is assigned to void, (n,) bool, by the source's standardiser and centroids
-    and by cosine distance; with equal distances it is assigned to control."""
+    """Return whether each of states (n, d) is assigned to void, (n,) bool, by cosine distance to the centroids.
+
+    Standardiser and centroids are the source's; with equal distances a state is assigned to control.
+    """
     _check_labels(source.void)
     known = np.asarray(source.states, float)
     mean, scale = standardiser(known)
@@ -272,7 +276,9 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Return scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source. No label
-    of a target is read."""
+    """Return scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source.
+
+    No label of a target is read.
+    """
     probes = {source: fit(layer[source].states, layer[source].void) for source in {s for s, _ in pairs}}
     return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

@@ -53,7 +53,7 @@ class NothingConfabulated(TrapsError):
 
 @dataclass(frozen=True)
 class Confabulated:
-    """By dataset, the scenarios on whose void item the model confabulated, or the reason why there is none."""
+    """By dataset, the scenarios on whose void item the model confabulated, or the reason for a missing entry."""
 
     scenarios: Mapping[str, frozenset[str]]
     problems: Mapping[str, str] = field(default_factory=dict)
@@ -76,8 +76,10 @@ def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> 
 
 @dataclass
 class ProbeRun:
-    """The probes of one model under one VQA prompt. items: the id table, with the columns dataset, scenario_id, side
-    and sub_scenario."""
+    """The probes of one model under one VQA prompt.
+
+    items: the id table, with the columns dataset, scenario_id, side and sub_scenario.
+    """
 
     items: pd.DataFrame
     read: ReadLayer
@@ -137,7 +139,7 @@ class ProbeRun:
         for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
             rows += of_layer
             progress(done, self.n_layers)
-        return marked(rows + self._problems())
+        return mark_layers(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
         """Return every row of one layer, whose states are in memory only during this call."""
@@ -146,8 +148,10 @@ class ProbeRun:
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """Return the rows of one layer that baselines have as well: transfer, held out, Cf->Cf, look-alikes, swapped
-        times."""
+        """Return the rows of one layer that baselines share.
+
+        These are transfer, held out, Cf->Cf, look-alikes and swapped times.
+        """
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
         unseen = {source: self._unseen_scores(source, splits) for source in self._own}
         rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
@@ -168,8 +172,10 @@ class ProbeRun:
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return those of these pairs whose datasets share their controls, by probes that were fitted without the
-        scored scenario; without a figure where too few scenarios are left to split."""
+        """Return the `confabulated_transfer` pairs with shared controls, by probes fitted without the scored scenario.
+
+        A pair has no figure if too few scenarios are left to split.
+        """
         restricted, rows = self._confabulated(splits), []
         for source, target in self._pairs:
             if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):
@@ -187,7 +193,7 @@ class ProbeRun:
         return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
 
     def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
-        """Return why probes of a source cannot leave a fold of scenarios out; empty if they can."""
+        """Return why a source's probes cannot hold out a fold of scenarios; empty if they can."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
@@ -216,20 +222,19 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return the pairs within a taxonomy, and each dataset on itself, by probes that were fitted without the scored
-        scenario."""
+        """Return the pairs within a taxonomy, a dataset on itself too, by probes fitted without the scored scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
         return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return clips that can be answered although they look like voids, scored by the probes of each dataset: void
-        clips with a question that they answer, decoys (a panel that hides nothing), and whole clips as short as a void.
+        """Return answerable clips that resemble voids, scored by the probes of each dataset.
 
-        answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have (a panel, the
-        length), 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC of these against
-        the controls; the reverse. Probes of the same taxonomy are fitted without the scored scenario.
+        These are void clips with an answerable question, decoys (an occluder that hides nothing), and whole clips as
+        short as a void. answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have
+        (an occluder, the length), 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC
+        of these against the controls; the reverse. Probes of the same taxonomy are fitted without the scored scenario.
         """
         rows = []
         for source, (extra, of_extra) in product(self._own, LOOK_ALIKES.items()):
@@ -250,8 +255,10 @@ class ProbeRun:
     def time_swapped(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return chaotic's frames with the times of the other side, whose label is that of the frames: 1 for a probe
-        that reads the frames, 0 for one that reads the time stamps."""
+        """Return AUROC on chaotic's frames with the other side's times, labelled by the frames.
+
+        It is 1 for a probe that reads the frames, 0 for one that reads the time stamps.
+        """
         if TIME_SWAPPED not in splits:
             return []
         of = splits[TIME_SWAPPED]
@@ -265,8 +272,10 @@ class ProbeRun:
         return scores[name][mask], splits[name].scenario[mask]
 
     def _unseen_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Return scores of the items of every dataset by probes that were not fitted on their scenarios: one probe for
-        items of another taxonomy, one per fold for those of the source's own."""
+        """Return scores of every dataset's items by probes fitted without their scenarios.
+
+        There is one probe for items of another taxonomy, and one per fold for those of the source's own.
+        """
         split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
         others = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
@@ -283,8 +292,10 @@ class ProbeRun:
 
     def centroids(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
         """Return shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void.
-        The centroids of a taxonomy's two datasets come from the same controls, so that of their controls these shares
-        are too low; `baselines` has the same of noise."""
+
+        The centroids of a taxonomy's two datasets come from the same controls, so these shares are too low for
+        controls; `baselines` has the same of noise.
+        """
         splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:
             assigned, split = nearest_centroid(splits[source], splits[target].states), splits[target]
@@ -315,10 +326,10 @@ class ProbeRun:
 
 
 def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]:
-    """Yield the results of `work` for each layer, in order. Each core works on one layer, at most four at a time, since
-    each holds its states in memory.
+    """Yield the results of `work` for each layer, in order, on up to four cores.
 
-    Linear algebra uses one thread per layer: at these sizes a second thread costs more than it saves.
+    Each core works on one layer and holds its states in memory. Linear algebra uses one thread per layer: at these
+    sizes a second thread costs more than it saves.
     """
     from threadpoolctl import threadpool_limits
 
@@ -350,11 +361,12 @@ def _row(
     }
 
 
-def marked(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with marks on the layers that tables show: own_best, the maximum of the row's own curve (the
-    paper's choice, which uses target labels); all_sample_best, the maximum of the pair's all-sample transfer curve;
-    chosen, the layer of the target without its labels (`layer_choice`). Of several layers with the same maximum the
-    lowest is best.
+def mark_layers(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with flags on the layers that tables show.
+
+    own_best: the maximum of the row's own curve (the paper's choice, which uses target labels); all_sample_best: the
+    maximum of the pair's all-sample transfer curve; chosen: the layer of the target without its labels
+    (`layer_choice`). Of several layers with the same maximum the lowest is best.
     """
     curves: dict[tuple[str, str, str], dict[int, float]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""The versions of settings, prompts and precision that the mechanistic stages depend on. Nothing here needs torch."""
+"""Versions of the settings, prompts and precision that the mechanistic stages depend on, without importing torch."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
-    """Return the parameters of a local model that its states depend on: those of its entry without sampling, in the
-    precision in which states are read."""
+    """Return the parameters of a local model that its states depend on.
+
+    These are its entry's without sampling, in the precision in which states are read.
+    """
     inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
     params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
     skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
@@ -31,7 +33,7 @@ def loaded_params(entry: ModelEntry) -> dict[str, Any]:
 
 
 def shown_inside(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
-    """Return a model's entry with the media that the study shows it where it is looked into."""
+    """Return a model's entry with the media settings of the study's mechanistic analyses."""
     media = settings.models[entry.id].media
     return entry if media is None else entry.model_copy(update={"media": media})
 
@@ -42,7 +44,7 @@ def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
 
 
 def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
-    """Return whether the extraction of a partition was finished and all of its files still exist."""
+    """Return whether a partition's extraction was finished and all of its files still exist."""
     from traps_pipeline.storage.parquet import read_sealed
 
     folder = states_folder(workspace, cell)
@@ -62,8 +64,10 @@ def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt,
-    pooling."""
+    """Return the digest of the inputs of hidden states besides items.
+
+    These are checkpoint and precision, frames, VQA prompt and pooling.
+    """
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     if settings is not None and entry.id in settings.models:
         entry = shown_inside(entry, settings)
@@ -91,8 +95,9 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the inputs of sentences besides items and answers: those of states, the sentences, the
-    prompt.
+    """Return the digest of the inputs of sentences besides items and answers.
+
+    These are the inputs of states, the sentences and the prompt.
     """
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
@@ -102,7 +107,7 @@ def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def patching_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
+    """Return the digest of the inputs of patching besides items: those of hidden states, pairs, sites and seed."""
     settings = workspace.study.mechanism
     if settings is None or settings.patching is None or extraction.model not in settings.models:
         return "none"
@@ -111,8 +116,10 @@ def patching_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def steering_version(workspace: Workspace, run: str) -> str:
-    """Return the digest of the inputs of steered answers besides items and directions: the study's settings, model and
-    prompt."""
+    """Return the digest of the inputs of steered answers besides items and directions.
+
+    These are the study's settings, the model and the prompt.
+    """
     model, _, regime = run.split("__")
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:

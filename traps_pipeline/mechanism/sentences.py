@@ -1,8 +1,8 @@
-"""The output side in whole sentences: how likely an abstention is to the model, beside the answer that it gave.
+"""The output side in whole sentences: the likelihood of abstentions, beside that of the model's own answer.
 
-The output margin is of the first answer token, and a model that begins every answer with "The" shows nothing there.
-Here every sentence of a set, and the model's own answer, is put behind the benchmark's prompt (teacher forcing), and
-its tokens' log-probabilities are averaged, so that long and short sentences are comparable. One pass a sentence.
+The output margin covers only the first answer token, and shows nothing for a model that begins every answer with "The".
+Here every sentence of a set, and the model's own answer, follows the benchmark's prompt (teacher forcing), and the
+log-probabilities of its tokens are averaged, so that long and short sentences are comparable. One pass per sentence.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
-OWN_TOKENS = 64  # of the model's own answer, from its beginning
+OWN_TOKENS = 64  # tokens of the model's own answer, from its beginning
 
 
 def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[SentenceRow]:
-    """Return the rows of SENTENCES: every item of the pairs under the benchmark's prompt of the extraction's name, with
-    the model's answer of run 1. Raises TrapsError for a model that was not asked under that prompt."""
+    """Return the rows of SENTENCES: every item of the pairs with the model's answer of run 1.
+
+    The prompt is the benchmark's of the extraction's name. Raises TrapsError for a model that was not evaluated under
+    it.
+    """
     from traps_pipeline.models.local.adapter import load_local_model
 
     assert entry.media is not None, "local entries have media"
@@ -48,7 +51,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
             prompt = probed_item(workspace, model, entry.media, about, system_prompt(regime)).prompt()
             text = texts.get(about["item_id"])
             own = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
-            with model.remembering_clips():
+            with model.caching_clips():
                 likely = {name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()}
                 answer = mean_log_probability(model, prompt, own) if own else None
             best = max(likely, key=lambda name: likely[name])
@@ -76,7 +79,7 @@ def answer_tokens(model: LocalModel, text: str) -> list[int]:
 
 
 def mean_log_probability(model: LocalModel, prompt: Prompt, tokens: list[int]) -> float:
-    """Return the mean log-probability (nats a token) of tokens behind a prompt, in one pass of batch size 1."""
+    """Return the mean log-probability (nats per token) of tokens after a prompt, in one pass of batch size 1."""
     import torch
 
     forced = prompt.followed_by(tokens)

@@ -1,8 +1,8 @@
-"""How often a steered model abstains, on one path and over the paths of a set, from STEERING and STEERING_VOTES rows
-(docs/spec.md 8.4).
+"""Abstention rates of a steered model, by path and over sets of paths (docs/spec.md 8.4).
 
-A path asks each scenario once, so its Wilson interval covers the variation of scenarios. Several paths ask the same
-scenario, and one answer may count in several paths; intervals over paths therefore resample scenarios, not answers.
+They are computed from STEERING and STEERING_VOTES rows. A path asks each scenario once, so its Wilson interval covers
+the variation of scenarios. Several paths ask the same scenario, and one answer may count in several paths; intervals
+over paths therefore resample scenarios, not answers.
 """
 
 from __future__ import annotations
@@ -43,27 +43,33 @@ _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of answers, votes or effects that follow the paper's protocol: void directions, doses in alpha,
-    and signs by label. Unsteered answers (alpha 0) are among them."""
+    """Return the rows of answers, votes or effects that follow the paper's protocol.
+
+    These have void directions, doses in alpha, and signs by label. Unsteered answers (alpha 0) are among them.
+    """
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 
 def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return the answers with their verdicts, one row for every path that an answer belongs to; an unsteered answer
-    (alpha 0) belongs to every path."""
+    """Return the answers with their verdicts, one row per path of an answer.
+
+    An unsteered answer (alpha 0) belongs to every path.
+    """
     copied = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
     plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=_ALONG)
-    same = [*_RUN, "dataset", "side", "scenario_id"]  # a path is compared with the model as it is on its own scenarios
+    same = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
     paths = steered[[*same, *_ALONG]].drop_duplicates()
     return pd.concat([steered, plain.merge(paths, on=same)], ignore_index=True)
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return the answers with `abstained` and `correct`, the majority's decisions; null without a text, votes or a
-    majority, and `correct` on voids. Each cell is decided by itself: after a change of panel, a cell has votes of the
-    old panel until its votes are made again."""
+    """Return the answers with `abstained` and `correct`, the majority's decisions.
+
+    They are null without a text, votes or a majority, and `correct` on voids. Each cell is decided by itself: after a
+    change of panel, a cell keeps votes of the old panel until the new votes are made.
+    """
     votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
     for cell, of_cell in answers.groupby(_CELL, sort=False):
@@ -108,9 +114,11 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Return rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set, for each
-    regime of directions and of answers and over all regimes, with an interval from resampled scenarios (all paths share
-    the scenarios of a resample, and the unseen one)."""
+    """Return rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set.
+
+    There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
+    scenarios (all paths share the scenarios of a resample, and the unseen one).
+    """
     decided = answers_of_paths(of_paper(answers), of_paper(votes)).dropna(subset=["abstained"])
     decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
     rows: list[SteeringShareRow] = []
@@ -139,9 +147,9 @@ def share_rows(
 
 
 def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> np.ndarray:
-    """Return the ends of the share of each path, of which the first are what was observed: (2, paths, 1 + resamples).
+    """Return the ends of the share of each path, the observed ones first: (2, paths, 1 + resamples).
 
-    An answer that stands in several paths is one answer, so all paths of a taxonomy have one unseen scenario.
+    An answer in several paths is one answer, so all paths of a taxonomy have one unseen scenario.
     """
     ends = np.empty((2, n_paths, 1 + resamples))
     numbered = numbered.assign(taxonomy=numbered["dataset"].map(taxonomy_of))
@@ -162,7 +170,7 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
 
 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield the sets of paths that are averaged: the columns that name each set, and its rows of `paths`."""
+    """Yield the sets of paths to average: the columns that name each set, and its rows of `paths`."""
     pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
     every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
     for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):

@@ -1,4 +1,4 @@
-"""The mechanistic stages: each reads tables and makes the rows of one. The numerics are in the modules they call."""
+"""The mechanistic stages: each reads tables and returns the rows of one; other modules hold the numerics."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
 from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.probing_versions import shown_inside, states_folder
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
@@ -50,8 +50,10 @@ if TYPE_CHECKING:
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """Return the entry of a model in the study's `mechanism` section, with the media that it is shown there. Raises
-    TrapsError if it is not local, or not there."""
+    """Return the entry of a model in the study's `mechanism` section, with that section's media settings.
+
+    Raises TrapsError if it is not local, or not in the section.
+    """
     entry, settings = get_model(model), workspace.mechanism
     if entry.backend != LOCAL:
         local = ", ".join(name for name in settings.models if get_model(name).backend == LOCAL) or "none of the study's"
@@ -68,7 +70,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
 
 
 def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenStatesRow], int]:
-    """Make the missing states of a partition; returns its rows, and how many states were made."""
+    """Extract the missing states of a partition; return its rows, and the number of new states."""
     from traps_pipeline.mechanism.hidden_states import extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
 
@@ -110,8 +112,10 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
 
 
 def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:
-    """Return the item of a row of PROBE_ITEMS, as the study pools its states. Raises TrapsError where a pooling
-    compares the clips of a pair and the scenario lacks one."""
+    """Return the item of a row of PROBE_ITEMS, as the study pools its states.
+
+    Raises TrapsError if a pooling compares the clips of a pair and the scenario lacks one.
+    """
     from traps_pipeline.mechanism.hidden_states import clip_item
     from traps_pipeline.models.local.capture import OF_PAIRS
 
@@ -121,7 +125,7 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
-    """Return those of the first and last layers that hold a number that is not finite."""
+    """Return which of the first and last layers contain a number that is not finite."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
     folder = workspace.bring_folder(states_folder(workspace, cell))
@@ -129,7 +133,7 @@ def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> lis
 
 
 def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
-    """Raise TrapsError if the study names a layer that the model does not have, before the long extraction begins."""
+    """Raise TrapsError if the study names a layer that the model lacks, before the long extraction begins."""
     layers = workspace.mechanism.models[model]
     for name, layer in (
         ("steering", layers.steering),
@@ -147,7 +151,7 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Return rows of an extraction's probes. If none of their inputs has changed, the existing rows are returned."""
+    """Return rows of an extraction's probes; reuse the existing rows if none of their inputs has changed."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     confabulated = confabulations(workspace, extraction.model)
@@ -179,8 +183,10 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """Return, by dataset, the scenarios on whose void the model confabulated under Standard in run 1, or why there is
-    none."""
+    """Return, by dataset, the scenarios on whose void the model confabulated under Standard in run 1.
+
+    A dataset without any has the reason instead.
+    """
     scenarios: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
     for dataset in DATASETS:
@@ -204,7 +210,7 @@ def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) 
 
 
 def direction_rows(workspace: Workspace, extraction: Extraction) -> list[DirectionRow]:
-    """Make and save the directions of every dataset that has states; rows of the directions table."""
+    """Compute and save the directions of every dataset with states; return rows of the directions table."""
     examined_model(workspace, extraction.model)
     states = StoredStates.of(workspace, extraction)
     rows: list[DirectionRow] = []
@@ -221,8 +227,10 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
 def direction_pairs(
     settings: MechanismSettings, dataset: str, items: pd.DataFrame
 ) -> tuple[list[str], list[int], list[int]]:
-    """Return the scenarios that a dataset's direction is computed from, and the rows of their voids and controls among
-    the dataset's items. Raises TrapsError for a study that steers nothing."""
+    """Return the scenarios behind a dataset's direction, and the rows of their voids and controls.
+
+    Raises TrapsError for a study without steering.
+    """
     steering = settings.steering
     if steering is None:
         raise TrapsError(
@@ -285,9 +293,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
 
 
 def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
-    """Return the directions of an extraction by dataset. Raises TrapsError for a file that is not the one in the
-    table.
-    """
+    """Return the directions of an extraction by dataset. Raises TrapsError for a file that differs from the table's."""
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
     result = {}
     for path in sorted(set(table["path"])):

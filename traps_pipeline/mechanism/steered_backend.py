@@ -1,7 +1,7 @@
-"""A local model that answers with a direction added to one block: the backend of steered requests.
+"""The backend of steered requests: a local model that answers with a direction added to one block.
 
-Requests of one layer are generated together; what another process of the machine has made of them is taken from it
-(`made_answers`).
+Requests of one layer are generated together; answers that another process of the machine has generated are reused
+(`shared_answers`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.mechanism.made_answers import MadeAnswers
+from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.models.local.backend import LocalBackend, outcome
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Outcome, Request
@@ -26,22 +26,21 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block, each row with a direction and an alpha of its
-    own."""
+    """A local model that answers with a direction added to one block; each row has its own direction and alpha."""
 
-    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: MadeAnswers) -> None:
+    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
         super().__init__(entry)
         self._vectors, self._made = vectors, shared
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread, but for what another process has made of it."""
+        """Answer a batch, in the worker thread, except for answers from another process."""
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
         """Answer requests; rows of one layer are generated together, and unsteered rows apart.
 
-        stopped: asked at every token, ends early.
+        stopped: called at every token, ends generation early.
         """
         from traps_pipeline.mechanism.hook import Steering
 
@@ -60,7 +59,7 @@ class SteeredBackend(LocalBackend):
                 vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
                 hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
             most = requests[0].params["max_new_tokens"]
-            with model.remembering_clips():
+            with model.caching_clips():
                 generated = model.generate(prompts, most, None, hook, stopped=stopped)
             for number, one in zip(numbers, generated, strict=True):
                 counts = (one.prompt_tokens, one.completion_tokens)
@@ -73,12 +72,11 @@ class SteeredBackend(LocalBackend):
         return load_local_model(self._entry, inside=True)
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
-        """Return a processed prompt, kept in memory; `digest` identifies the frames, so a re-rendered clip is a new
-        prompt."""
+        """Return a processed prompt, cached in memory; `digest` identifies the frames."""
         frames = sample(clip, self._spec)
         return self._model().prompt(system, user, frames.frames, frames.times_s.tolist())
 
 
 def _asked(request: Request) -> tuple[Any, str | None, str, str]:
-    """Return what a request's prompt depends on."""
+    """Return the part of a request that its prompt depends on."""
     return request.media, request.media_digest, request.system, request.user

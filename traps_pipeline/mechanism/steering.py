@@ -1,12 +1,12 @@
-"""Steering: the answers of each cell, how they are generated, and the panel's votes on them (docs/spec.md 8).
+"""Steering: the answers of each cell, their generation, and the panel's votes on them (docs/spec.md 8).
 
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
 three, so that all directions share one answer. The two datasets of a taxonomy have the same control items, and share
-their answers too; so do two sign policies where they add the same.
+their answers too; so do two sign policies that add the same.
 
-Doses are given as alphas, the paper's, and in units of the class gap, since one alpha is a large step in one model and
-none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
+Doses are given as alphas, as in the paper, and in units of the class gap, since one alpha is a large step in one model
+and none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
-from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.mechanism_rows import STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.probing_versions import loaded_params
+from traps_pipeline.mechanism.shared_answers import SharedAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
-from traps_pipeline.models.ask import Settled, collect
+from traps_pipeline.models.ask import SettledCell, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
@@ -42,14 +42,17 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
 
-UNSTEERED = "none"  # source and kind where alpha is 0
+UNSTEERED = "none"  # source and kind if alpha is 0
 BY_LABEL = "label"  # the paper's sign policy, which knows the side of each item
 
 
 @dataclass(frozen=True)
 class Strength:
-    """One direction at one strength. alpha has no sign: `signs` says on which side alpha times the direction is added
-    and on which it is subtracted. dose: in its unit, one of DoseUnit."""
+    """One direction at one strength.
+
+    alpha has no sign: `signs` says on which side alpha times the direction is added and on which it is subtracted.
+    dose: in its unit, one of DoseUnit.
+    """
 
     source: str
     kind: str
@@ -62,8 +65,8 @@ class Strength:
     dose: float = 0.0
     signs: str = BY_LABEL
 
-    def signed(self, side: str) -> float:
-        """Return the signed alpha for a row of that side."""
+    def signed_alpha(self, side: str) -> float:
+        """Return the signed alpha of a side."""
         return sign_of(self.signs, side) * self.alpha
 
 
@@ -77,7 +80,7 @@ NO_STEERING = Strength(UNSTEERED, UNSTEERED, 0, 0.0, None, 0.0)
 
 @dataclass(frozen=True)
 class SteeredQuestion(Question):
-    """The call that asks a steered model an item."""
+    """The call that asks a steered model about an item."""
 
     strength: Strength
 
@@ -88,10 +91,12 @@ class SteeredQuestion(Question):
 def strengths(
     target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
 ) -> list[tuple[Strength, tuple[str, ...]]]:
-    """Return the strengths with which a target is steered, each with the sides: every path into the target whose source
-    has a direction, the random and shuffled directions of that source, and the sweep over layers (along the target's
-    own direction, on controls alone). directions: by source. Raises TrapsError for a layer that does not exist, and if
-    no source has a direction."""
+    """Return the strengths at which a target is steered, each with its sides.
+
+    These are every path into the target whose source has a direction, the random and shuffled directions of that
+    source, and the sweep over layers (along the target's own direction, only on controls). directions: by source.
+    Raises TrapsError for a layer that does not exist, and if no source has a direction.
+    """
     steering = settings.steering
     assert steering is not None, "an experiment without steering has no steering cells"
     pairs: list[tuple[Strength, tuple[str, ...]]] = [(NO_STEERING, SIDES)]
@@ -122,15 +127,17 @@ Dose = tuple[str, float]  # unit and number
 
 
 def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return the doses of a direction without those in class gaps that are longer than `cap` control states; of a null
-    the largest one."""
+    """Return the doses of a direction, except those in class gaps beyond `cap` control states.
+
+    A null has only the largest one.
+    """
     longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
     doses = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
     return doses if row.kind == "void" else doses[-1:]
 
 
 class _Planned(NamedTuple):
-    """A direction along which a target is steered, with the sides and doses; a null is steered at the largest alone."""
+    """A direction along which a target is steered, with sides and doses; a null has only the largest dose."""
 
     source: str
     kind: str
@@ -142,8 +149,11 @@ class _Planned(NamedTuple):
 
 
 def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
-    """Return every direction along which a target is steered, among these sources: all paths into it; along its own
-    direction also the other sign policies, the nulls at the largest dose, and on controls the sweep over layers."""
+    """Return every direction along which a target is steered, among these sources.
+
+    These are all paths into it; along its own direction also the other sign policies, the nulls at the largest dose,
+    and on controls the sweep over layers.
+    """
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
     at = layers.steering
@@ -160,8 +170,10 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """Return the number of answers that steering a model needs, by inference regime and side; an answer that cells
-    share counts once. scenarios: their number by taxonomy."""
+    """Return the number of answers that steering a model needs, by inference regime and side.
+
+    An answer that cells share counts once. scenarios: their number by taxonomy.
+    """
     steering = settings.steering
     if steering is None:
         return {}
@@ -197,7 +209,7 @@ def wanted_steered(
     cell: SteeringCell,
     directions: Mapping[str, Directions],
 ) -> list[SteeredQuestion]:
-    """Return the calls for every answer of a cell, those about one prompt side by side: its clip is then seen once."""
+    """Return the calls for every answer of a cell, those with the same prompt together, to share its clip."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -228,7 +240,7 @@ def steered_request(
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
     if strength.alpha:
-        signed = strength.signed(item["side"])
+        signed = strength.signed_alpha(item["side"])
         steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
     return Request(
         participant=entry.id,
@@ -244,7 +256,7 @@ def steered_request(
 
 
 def shared_item(item: Mapping[str, Any]) -> str:
-    """Return the item's id for the ledger: a control is one item in both datasets of its taxonomy."""
+    """Return the item's id in the ledger: a control is one item in both datasets of its taxonomy."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
@@ -258,11 +270,10 @@ def collect_steered(
     cells: Sequence[SteeringCell],
     directions: Mapping[str, Mapping[str, Directions]],
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
-    """Generate the missing answers; yields the STEERING rows of each finished cell. directions: by VQA prompt, then by
-    source.
+    """Generate the missing answers; yield the STEERING rows of each finished cell.
 
-    Several processes may do so at once: one writes the answers of an evaluation, and whoever waits for it makes answers
-    in the meantime (`made_answers`).
+    directions: by VQA prompt, then by source. Several processes may run it at once: one writes the answers of an
+    evaluation, and the others generate answers meanwhile (`shared_answers`).
     """
     vectors = {
         vector_digest(vector): vector
@@ -273,18 +284,18 @@ def collect_steered(
         for vector in draw
     }
 
-    store = MadeAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
+    store = SharedAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
         questions = wanted_steered(workspace, entry, cell, directions[cell.directions])
         store.chunks([each.request for each in questions])
         return questions
 
-    def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
+    def finish(settled: SettledCell[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
         store.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
-        return settled.made(partial(_steering_row, plain))
+        return settled.output(partial(_steering_row, plain))
 
     def make(entry: Entry) -> SteeredBackend:
         return SteeredBackend(entry, vectors, store)
@@ -299,10 +310,10 @@ def _make_meanwhile(
     workspace: Workspace,
     cell: SteeringCell,
     questions: Sequence[SteeredQuestion],
-    shared: MadeAnswers,
+    shared: SharedAnswers,
     backend: SteeredBackend,
 ) -> None:
-    """Make answers of a cell while another process writes those of its evaluation."""
+    """Generate answers of a cell while another process writes those of its evaluation."""
     report = progress.current()
     report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
     requests = [each.request for each in questions]
@@ -335,16 +346,20 @@ def _steering_row(
 def collect_steering_votes(
     workspace: Workspace, cells: Sequence[SteeringCell]
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
-    """Ask the study's panel whether each steered answer abstains and whether a control's is correct; yields the
-    STEERING_VOTES rows of each finished cell."""
+    """Ask the study's panel whether each steered answer abstains and whether a control's is correct.
+
+    Yields the STEERING_VOTES rows of each finished cell.
+    """
     panel = load_panel(workspace.study.panel)
     calls = partial(wanted_steering_ballots, workspace, panel)
-    yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
+    yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.output(_vote_row))
 
 
 def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:
-    """Return the calls for every vote on the steered answers of a cell. A ballot's item is the answer's row with the
-    columns of its item."""
+    """Return the calls for every vote on the steered answers of a cell.
+
+    A ballot's item is the answer's row with the columns of its item.
+    """
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
         shared = item | {"item_id": shared_item(answer)}

@@ -39,7 +39,7 @@ TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
 
 
 def probed_taxonomy(dataset: str) -> str:
-    """Return the taxonomy whose scenarios a probed dataset has."""
+    """Return the taxonomy of a probed dataset's scenarios."""
     return "chaotic" if LOOK_ALIKES.get(dataset, dataset).startswith("chaotic") else "occlusion"
 
 
@@ -49,5 +49,5 @@ def path_name(source: str, target: str) -> str:
 
 
 def sources_of(target: str) -> tuple[str, ...]:
-    """Return the datasets along whose directions a target is steered."""
+    """Return the datasets whose directions steer a target."""
     return tuple(source for source, other in STEERING_PATHS if other == target)

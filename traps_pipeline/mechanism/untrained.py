@@ -1,6 +1,6 @@
-"""States of a network that has learnt nothing: the same class, sizes and prompts, with random weights.
+"""States of an untrained network: the same class, sizes and prompts, with random weights.
 
-What a gate does on them, it does from the inputs alone, through features that no training chose.
+A gate on them uses only the inputs, through features that no training chose.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pandas as pd
 
 from traps_pipeline.mechanism.hidden_states import item_states
 from traps_pipeline.mechanism.stages import probed_item
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import LocalModel
@@ -22,8 +22,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
-    """Return the entry's network with random weights, on its device and in its precision, unquantised. It takes the
-    memory of a second model."""
+    """Return the entry's network with random weights, on its device and in its precision, unquantised.
+
+    It takes the memory of a second model.
+    """
     import torch
 
     trained = load_local_model(entry, inside=True)
@@ -44,9 +46,7 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
 def untrained_states(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, items: Mapping[str, pd.DataFrame]
 ) -> dict[str, np.ndarray]:
-    """Return the states (n, d) of every item at the middle block of the untrained network, pooled as the study
-    pools.
-    """
+    """Return the states (n, d) of every item at the untrained network's middle block, pooled as in the study."""
     model = untrained_model(entry, workspace.mechanism.seed)
     system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"

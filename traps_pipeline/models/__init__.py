@@ -1,1 +1,1 @@
-"""Who answers: the registry of models, what is asked (Request), what comes back (Outcome), who asks (backends)."""
+"""Models and judges: the registry, requests and outcomes, the backends, and how calls are sent and recorded."""

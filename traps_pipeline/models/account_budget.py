@@ -1,8 +1,8 @@
-"""A cap of one account over all studies that are asked through it, on one machine or a shared disk.
+"""Cap an account's spending over all studies that use it, on one machine or a shared disk.
 
-A study's own budget knows what its own ledger holds. Two studies that use one key could spend twice; so each may name
-a folder for an account. The folder's `budget.yaml` gives the cap; `spent.jsonl` has one line a change, which every
-process appends under a lock that it holds for that moment only: several runs go on at once and share what is left.
+A study's own budget knows only its own ledger, so two studies with one key could spend twice. Each may therefore name a
+folder for an account. The folder's `budget.yaml` gives the cap; `spent.jsonl` has one line per change, which every
+process appends under a lock that it holds for that moment only: concurrent runs share what is left.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_in_place, remedy, write_bytes
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, is_whole
+from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, is_whole, line_with_checksum
 
 CAP, SPENT = "budget.yaml", "spent.jsonl"
-_COMPACTED = 2**20  # bytes of lines from which on they are summed up when a run begins
+_COMPACTED = 2**20  # bytes of lines above which a run compacts them at its start
 
 
 class Cap(BaseModel):
-    """`budget.yaml` of an account's folder. usd: dollars for all studies together, ever."""
+    """The contents of `budget.yaml` in an account's folder. usd: dollars for all studies together, ever."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     usd: float = Field(ge=0, allow_inf_nan=False)
 
 
 class AccountBudget:
-    """What all studies may still spend through an account. `study` is the name that this one's lines carry.
+    """The remaining budget of an account over all studies. study: the name in this study's lines.
 
-    A line is added before a call is sent, with its worst case, and another with the difference when its cost is known.
-    A process that is killed leaves the worst case of its calls in flight there for good.
+    A line reserves a call's worst case before it is sent, and another adds the difference when its cost is known. A
+    killed process leaves the worst case of its calls in flight reserved for good.
     """
 
     def __init__(self, account: str, folder: Path, study: str) -> None:
@@ -53,8 +53,8 @@ class AccountBudget:
         self._descriptor, self._read = -1, 0
         with self._held():
             if self._read > _COMPACTED:
-                content = b"".join(checked_line({"study": name, "usd": usd}) for name, usd in self._spent.items())
-                write_bytes(self._path, content, durable=True)  # other processes see another file and read that
+                content = b"".join(line_with_checksum({"study": name, "usd": usd}) for name, usd in self._spent.items())
+                write_bytes(self._path, content, durable=True)  # other processes notice the new file and read it
 
     @property
     def _path(self) -> Path:
@@ -62,19 +62,22 @@ class AccountBudget:
 
     @property
     def spent_usd(self) -> Mapping[str, float]:
-        """Dollars spent or on their way, by study."""
+        """Dollars spent or reserved, by study."""
         with self._held():
             return dict(self._spent)
 
     def begin(self, known_usd: float) -> None:
-        """Add what this study has spent through the account and the folder does not know: before it named the folder,
-        or because the file was lost. known_usd: dollars by the study's own ledgers and journal."""
+        """Add this study's spending through the account that the folder lacks.
+
+        It was spent before the study named the folder, or the file was lost. known_usd: dollars by the study's own
+        ledgers and journal.
+        """
         with self._held():
             if (missing := known_usd - self._spent[self.study]) > 1e-6:
                 self._append(missing)
 
     def reserve(self, dollars: float) -> bool:
-        """Take the worst case of a call, if it fits under the cap beside what every study has taken."""
+        """Reserve the worst case of a call, if the cap leaves room; return whether it does."""
         with self._held():
             if sum(self._spent.values()) + dollars > self.cap_usd + 1e-9:
                 return False
@@ -82,7 +85,7 @@ class AccountBudget:
             return True
 
     def correct(self, dollars: float) -> None:
-        """Put a call's cost in the place of its worst case: the difference, negative as a rule."""
+        """Replace a call's worst case by its cost: add the difference, usually negative."""
         if dollars:
             with self._held():
                 self._append(dollars)
@@ -97,14 +100,14 @@ class AccountBudget:
         )
 
     def close(self) -> None:
-        """Close the file; it stays."""
+        """Close the file without removing it."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
     @contextmanager
     def _held(self) -> Iterator[None]:
-        """Hold the file's lock for a moment, with all that others wrote meanwhile read."""
+        """Hold the file's lock for a moment, after reading all lines of other processes."""
         try:
             while True:
                 if self._descriptor < 0:
@@ -113,7 +116,7 @@ class AccountBudget:
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX)
                 if is_in_place(self._descriptor, self._path):
                     break
-                self.close()  # another process has summed the lines up into a new file
+                self.close()  # another process has compacted the lines into a new file
             try:
                 self._catch_up()
                 yield
@@ -131,7 +134,7 @@ class AccountBudget:
             self._read = 0
             self._spent.clear()
         content = os.pread(self._descriptor, size - self._read, self._read)
-        if torn := len(content) - (content.rfind(b"\n") + 1):  # of a process that died: its call was never sent
+        if torn := len(content) - (content.rfind(b"\n") + 1):  # torn line of a dead process: its call was never sent
             size, content = size - torn, content[:-torn]
             os.ftruncate(self._descriptor, size)
         for line in content.splitlines(keepends=True):
@@ -146,7 +149,7 @@ class AccountBudget:
         self._read = size
 
     def _append(self, dollars: float) -> None:
-        line = checked_line({"study": self.study, "usd": dollars})
+        line = line_with_checksum({"study": self.study, "usd": dollars})
         append_whole(self._descriptor, line)
         self._spent[self.study] += dollars
         self._read += len(line)

@@ -1,4 +1,4 @@
-"""The table of what models answer."""
+"""The table of models' answers."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""The responses stage: from the items of a cell to its table, one row an item."""
+"""The responses stage: turn a cell's items into the rows of its table, one per item."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.answer_rows import ResponseRow
-from traps_pipeline.models.ask import Call, Settled, collect
-from traps_pipeline.models.framing import framed
+from traps_pipeline.models.ask import Call, SettledCell, collect
+from traps_pipeline.models.framing import media_for_dataset
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import read_answer
@@ -28,25 +28,25 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.posteriors import posteriors
 from traps_pipeline.storage.workspace import Workspace
 
-# The columns of an item that a request, a response or a vote is made from.
+# The columns of an item that requests, responses and votes use.
 _ASKED = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
 _ASKED += ("media_digest", "benchmark_version", "aliases", "answer_type")
 
 
 @dataclass(frozen=True)
 class Question(Call):
-    """The call that puts an item to a model."""
+    """The call that asks a model about an item."""
 
     item: Mapping[str, Any]
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
-    """Return the call that puts an item to a model: frames or video, then the question, nothing else.
+    """Return the call that asks a model about an item: frames or video, then the question, nothing else.
 
-    What is sent of the clip is prepared here when it is not yet; every regime and run then shares it.
+    The clip's media are prepared here if they are missing; every regime and run then shares them.
     """
     clip, dataset = workspace.resolve(item["clip"]), dataset_of(item["item_id"])
-    spec = framed(entry.media, dataset) if entry.media else None
+    spec = media_for_dataset(entry.media, dataset) if entry.media else None
     media = workspace.media.prepare(clip, item["media_digest"], spec) if spec else None
     return Request(
         participant=entry.id,
@@ -63,18 +63,18 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
 
 
 def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]) -> bool:
-    """Return whether what is sent of an item's clip is made already."""
-    spec = framed(entry.media, dataset_of(item["item_id"])) if entry.media else None
+    """Return whether the media of an item's clip are prepared for this model."""
+    spec = media_for_dataset(entry.media, dataset_of(item["item_id"])) if entry.media else None
     return spec is None or workspace.media.known(item["media_digest"], spec) is not None
 
 
 def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
-    """Make what is sent of every clip of the cells, on all cores, first: encoding would hold calls up."""
+    """Prepare the media of every clip of the cells first, on all cores: encoding would delay calls."""
     jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
     for dataset, own in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
         if own is None:
             continue
-        spec = framed(own, dataset)
+        spec = media_for_dataset(own, dataset)
         items = [*asked_items(workspace, dataset)]
         workspace.bring(item["clip"] for item in items)
         for item in items:
@@ -85,7 +85,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
-    """Return every call that a cell wants, in the order of its items. Raises TrapsError when these are not made."""
+    """Return every call that a cell wants, in the order of its items. Raises TrapsError if there are no items."""
     entry = get_model(cell.evaluation.model)
     items = asked_items(workspace, cell.dataset)
     if not items:
@@ -94,8 +94,10 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return what is asked, told and judged of the items of a dataset, in order. Of equal texts one copy is held: a
-    cell of 100,000 items may have a hundred questions."""
+    """Return the columns of a dataset's items that requests, responses and votes use, in order.
+
+    Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
+    """
     copies: dict[str, str] = {}
     rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
     return with_posteriors(
@@ -109,7 +111,7 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 
 
 def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return items of a dataset; of graded cuts with `posterior`, which the strategy `bayes` knows."""
+    """Return items of a dataset; those of graded cuts with `posterior`, which the strategy `bayes` reads."""
     if dataset != GRADED:
         return items
     known = posteriors(workspace)
@@ -117,10 +119,12 @@ def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, An
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what reference strategies may read: side, labels, on a control its ground truth; the sub-scenario's
-    commonest answer goes to `prior` and to the rules alone, so that a corrected answer which changes it re-asks no
-    other model, and how probable answers are to `bayes` alone. A rule reads nothing else, and every other model nothing
-    at all."""
+    """Return the hidden facts that reference strategies may read: side, labels, on a control its ground truth.
+
+    Only `prior` and the rules read the sub-scenario's commonest answer, so that a corrected answer which changes it
+    re-asks no other model, and only `bayes` reads the probabilities of answers. A rule reads nothing else, and every
+    other model nothing at all.
+    """
     if entry.backend == "rule":
         return {"commonest_answer": item["commonest_answer"]}
     if entry.backend != "reference":
@@ -157,12 +161,14 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
 
 
 def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, StageOutput]]:
-    """Ask what is missing; the RESPONSES rows of each cell as it is done."""
+    """Ask for missing answers; yield the RESPONSES rows of each cell as it is done."""
     prepare_media(workspace, cells)
 
-    def finish(settled: Settled[Cell, Question]) -> tuple[Cell, StageOutput]:
+    def finish(settled: SettledCell[Cell, Question]) -> tuple[Cell, StageOutput]:
         traces = workspace.answers.reasoning(settled.cell.evaluation.key, settled.rows)
-        return settled.made(lambda cell, question, row: response_row(cell, question.item, row, traces.get(row["key"])))
+        return settled.output(
+            lambda cell, question, row: response_row(cell, question.item, row, traces.get(row["key"]))
+        )
 
     entries, calls = [get_model(cell.evaluation.model) for cell in cells], partial(wanted_questions, workspace)
     yield from collect(workspace, "responses", workspace.answers, entries, cells, calls, finish)

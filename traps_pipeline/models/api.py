@@ -1,7 +1,7 @@
-"""Models over the network, through litellm: one attempt a call, exactly the declared parameters, typed outcomes.
+"""Network models through litellm: one attempt per call, exactly the declared parameters, typed outcomes.
 
-Retries, pace and money are not here (`ask`). litellm is imported when first asked: it takes seconds and would fetch a
-price list from the network.
+Retries, pace and money are handled elsewhere (`ask`). litellm is imported on the first call: it takes seconds and would
+fetch a price list from the network.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.models.budget import worst_case_usd
 from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
 from traps_pipeline.models.endings import Ending
-from traps_pipeline.models.first_token import stored
+from traps_pipeline.models.first_token import stored_alternatives
 from traps_pipeline.models.provider_errors import ProviderError, read_error, retry_after_s
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
@@ -40,11 +40,11 @@ from traps_pipeline.models.transport import Exchange, watching
 from traps_pipeline.models.usage import Sizes, Usage, read_usage
 from traps_pipeline.storage.media import Media, data_uris
 
-UNKNOWN_ERROR = 500  # the status of an error object in a 200 that names none
-REFUSED_CONTENT = "content_policy"  # the error of a call whose content a provider's filter stopped
-DENIED = "http_403_denied"  # of a 403 that is not about the key
-MOST_KEPT = 4000  # characters of an answer that is out of order
-# What a person is told of a kind of failure.
+UNKNOWN_ERROR = 500  # default status of an error object in a 200
+REFUSED_CONTENT = "content_policy"  # the error of a call stopped by a provider's content filter
+DENIED = "http_403_denied"  # the error of a 403 that is not about the key
+MOST_KEPT = 4000  # characters of a malformed answer
+# Message for people, by kind of failure.
 _HAPPENED = {
     RATE_LIMITED: "asked too fast",
     UNREACHABLE: "not reached",
@@ -64,23 +64,23 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 @cache
 def load_litellm() -> Any:
-    """Return the library, told to send and to fetch nothing of its own. Raises TrapsError where it is not installed."""
+    """Return litellm, configured to send and fetch nothing of its own. Raises TrapsError if it is not installed."""
     require("api")
     from traps_pipeline.models.wire import use_in
 
-    os.environ["LITELLM_MODE"] = "PRODUCTION"  # else it takes variables from a .env of any folder above
+    os.environ["LITELLM_MODE"] = "PRODUCTION"  # otherwise it loads a .env file from any folder above
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
     os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"
     litellm: Any = import_module("litellm")
-    warnings.filterwarnings("ignore", "Pydantic serializer warnings")  # of odd answers, which become outcomes here
-    warnings.filterwarnings("ignore", "coroutine 'OpenAIChatCompletion")  # of calls given up before they began
+    warnings.filterwarnings("ignore", "Pydantic serializer warnings")  # malformed answers become outcomes here
+    warnings.filterwarnings("ignore", "coroutine 'OpenAIChatCompletion")  # about calls cancelled before they began
     logging.getLogger("LiteLLM").setLevel(logging.ERROR)  # it warns at every call of Gemini 3 that has a temperature
     litellm.telemetry = False
     litellm.suppress_debug_info = True
-    litellm.drop_params = False  # a parameter that a provider refuses is an error, never left out in silence
+    litellm.drop_params = False  # a parameter that a provider refuses is an error, never silently dropped
     litellm.callbacks = [_hook()]
     use_in(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
-    # Its import makes connections of its own, unwatched, and keeps them for whoever has the same time-out.
+    # Its import opens unwatched connections, and keeps them for callers with the same time-out.
     litellm.in_memory_llm_clients_cache.flush_cache()
     return litellm
 
@@ -88,7 +88,7 @@ def load_litellm() -> Any:
 def _hook() -> Any:
     """Return the hook that keeps litellm from pricing a response by its tables.
 
-    That takes a tenth of a call's CPU time, and prices are the registry's: this number is never read.
+    Pricing takes a tenth of a call's CPU time, and the registry has the prices: litellm's number is never read.
     """
     logger: Any = import_module("litellm.integrations.custom_logger").CustomLogger
 
@@ -101,20 +101,26 @@ def _hook() -> Any:
 
 @cache
 def client_version() -> str:
-    """Return the library that builds and sends calls, with its version."""
+    """Return name and version of the library that builds and sends calls."""
     return f"litellm {version('litellm')}"
 
 
 @cache
 def _internal_call() -> Any:
-    """Return litellm's own mark of a call that it need not log. Its log of every call, which nobody reads here, takes a
-    sixth of a call's CPU time and lags behind, holding what was sent: 5 KB a call without media, without a bound."""
+    """Return litellm's own mark of a call that it need not log.
+
+    Its log of every call, which nobody reads here, takes a sixth of a call's CPU time and lags behind, holding what was
+    sent: 5 KB a call without media, unbounded.
+    """
     return import_module("litellm._internal_context").is_internal_call
 
 
 def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
-    """Return the message parts that carry a clip. Gemini drops a `video_url` without a word, and samples a video
-    without metadata at 1 FPS: it gets a file part that says its rate."""
+    """Return the message parts that carry a clip.
+
+    Gemini silently drops a `video_url`, and samples a video without metadata at 1 FPS: it gets a file part that states
+    its rate.
+    """
     uris = data_uris(media)
     if media.profile == "images":
         return [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
@@ -151,7 +157,7 @@ class ApiBackend:
         self._told: set[str] = set()
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt; see `Backend`."""
+        """Return the outcome of one attempt; see `Backend`."""
         asked = messages(self._entry, request)
         _internal_call().set(True)
         with watching() as exchange:
@@ -161,15 +167,15 @@ class ApiBackend:
             except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
                 if not exchange.is_answered or exchange.content is None:
                     return self._failure(error, exchange)
-            if exchange.status is None:  # a defect of ours, or of a new version of the client library
+            if exchange.status is None:  # a bug of ours, or of a new version of the client library
                 exchange.sent = None
             elif (reported := read_error(exchange.content)) is not None:
                 return self._reported(reported, exchange)
-            return self._read(request, exchange)  # whatever the library makes of it
+            return self._read(request, exchange)  # whatever exception the library raises for it
 
     def _read(self, request: Request, exchange: Exchange) -> Outcome:
-        """Return what the provider's own bytes say."""
-        if exchange.content is None:  # a defect of ours, or a route of litellm's with connections of its own
+        """Return the outcome from the provider's own bytes."""
+        if exchange.content is None:  # a bug of ours, or a litellm route with its own connections
             raise self._malformed("the answer came over a connection that is not watched, so its bytes cannot be read")
         try:
             body = parse_body(exchange.content)
@@ -188,7 +194,7 @@ class ApiBackend:
         return TransientError(MALFORMED, raw=raw, why=redact(why))
 
     def _outcome(self, reply: Reply, request: Request) -> Outcome:
-        """Return the outcome of an answer: what is seen, what was thought, what it took."""
+        """Return the outcome of an answer: visible text, thinking, and usage."""
         prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
         frames = request.sent.n_frames if request.sent else 0
         usage = read_usage(reply.usage, Sizes(prompt_bytes, frames, len((reply.text or reply.refusal).encode())))
@@ -205,14 +211,13 @@ class ApiBackend:
             completion_tokens=believed and believed.completion,
             reasoning_tokens=believed and believed.reasoning,
             cost_usd=self._cost(usage, request),
-            first_token=stored(reply.first_token, request.about.get("regime")),
+            first_token=stored_alternatives(reply.first_token, request.about.get("regime")),
         )
 
     def _cost(self, usage: Usage | None, request: Request) -> float | None:
-        """Return dollars; None where the price or what was used is unknown.
+        """Return dollars; None if the price or the usage is unknown.
 
-        A usage that cannot be believed costs the call's worst case, and no less than the most that any of its counts
-        says.
+        An implausible usage costs the call's worst case, and no less than the highest of its counts.
         """
         if self._entry.prices is None or usage is None:
             return None
@@ -223,7 +228,7 @@ class ApiBackend:
         return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
-        """Return a failure as an outcome, or raise it as TransientError. Its text is for a person and never stored."""
+        """Return a failure as an outcome, or raise it as TransientError. Its text is for people and never stored."""
         from traps_pipeline.models.wire import cause_of
 
         if exchange.never_left:
@@ -238,8 +243,11 @@ class ApiBackend:
         raise TransientError(kind) from None
 
     def _reported(self, error: ProviderError | None, exchange: Exchange) -> Outcome:
-        """Return what a provider reports as an outcome, or raise it as TransientError. The status is the one on the
-        wire, or the one in the error object where that came with a 200. error: None if the body holds none."""
+        """Return a provider's error as an outcome, or raise it as TransientError.
+
+        The status is the one on the wire, or the one in the error object if that came with a 200. error: None if the
+        body holds none.
+        """
         reported = error or ProviderError(self._beginning(exchange))
         status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
@@ -258,14 +266,14 @@ class ApiBackend:
         raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None
 
     def _beginning(self, exchange: Exchange) -> str:
-        """Return how an answer without an error object begins, for a person."""
+        """Return the beginning of an answer without an error object, for people."""
         text = redact((exchange.content or b"").decode("utf-8", "replace"))  # before it is cut
         kind = exchange.headers.get("Content-Type", "no content type").partition(";")[0]
         begins = f", beginning {text[:60]!r}" if text.strip() else ""
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
     def _tell(self, kind: str, message: str, *, passes: bool = False) -> None:
-        """Say once for each kind what the provider said, without the key. passes: whether another try may help."""
+        """Report the provider's message once per kind, without the key. passes: whether a retry may help."""
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
@@ -275,7 +283,7 @@ class ApiBackend:
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:
-    """Return what went wrong in a word: http_<status> is final, anything else is worth another try."""
+    """Return the kind of a failure: http_<status> is final, anything else is worth a retry."""
     if status in TRANSIENT_STATUSES:
         return TRANSIENT_STATUSES[status]
     if status >= 500:

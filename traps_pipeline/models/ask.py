@@ -1,7 +1,7 @@
-"""Asking: wanted keys minus known keys, call the difference, append to the ledger, hand on what is complete.
+"""Ask for answers: call the wanted keys that the ledger lacks, append the results, and yield complete cells.
 
-The same code asks models and judges, reference ones and paid ones. There is no resume mode: a crash, a second run and
-a correction are the same operation (docs/models.md, "Ledger").
+The same code asks models and judges, reference ones and paid ones. There is no resume mode: a crash, a second run and a
+correction are the same operation (docs/models.md, "Ledger").
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
 from traps_pipeline.ledger.rows import settles
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget, BudgetReached
-from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.models.spending import sharing, spending
@@ -32,14 +32,14 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-GRACE_S = 30.0  # for calls in flight after SIGTERM or SIGHUP
-END_S = 1.5  # after the second signal
+GRACE_S = 30.0  # grace period of calls in flight after SIGTERM or SIGHUP
+END_S = 1.5  # grace period after the second signal
 INTERRUPTED = 130  # the exit code of a stopped run
 
 
 @dataclass(frozen=True)
 class Call:
-    """A call that a stage wants. Each stage has its own kind, which also holds what its table says of the call."""
+    """A call that a stage wants. Each stage has its own subclass, with the further columns of its table."""
 
     request: Request
 
@@ -50,8 +50,8 @@ Finished = TypeVar("Finished")
 
 
 @dataclass(frozen=True)
-class Settled(Generic[AnyCell, AnyCall]):
-    """A cell all of whose calls are answered: its calls, the ledger's row of each key, and what it took."""
+class SettledCell(Generic[AnyCell, AnyCall]):
+    """A cell whose calls are all answered: its calls, the ledger's row of each key, and the tally."""
 
     cell: AnyCell
     calls: Sequence[AnyCall]
@@ -59,11 +59,11 @@ class Settled(Generic[AnyCell, AnyCall]):
     tally: Tally
 
     def answered(self) -> Iterator[tuple[AnyCall, Row]]:
-        """Return each call with its row of the ledger."""
+        """Return each call with its ledger row."""
         return ((call, self.rows[call.request.key]) for call in self.calls)
 
-    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
-        """Return the cell and its table, a row a call, with how the calls went."""
+    def output(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
+        """Return the cell and its table, one row per call, with the tally of its calls."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
         counts = {"wanted": len(self.rows), "known": self.tally.cached, "asked": self.tally.asked}
         figures = {**counts, "failed": self.tally.errors, "dollars": round(dollars, 6)}
@@ -72,7 +72,10 @@ class Settled(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """What a stage asks. calls(cell): all calls it wants, made once a cell. finish(settled cell): makes its table."""
+    """A stage's calls.
+
+    calls(cell): returns all wanted calls, once per cell. finish(settled cell): returns its table.
+    """
 
     stage: str
     ledger: Ledger
@@ -80,7 +83,7 @@ class Work(Generic[AnyCell, AnyCall, Finished]):
     budget: Budget
     epoch: str
     calls: Callable[[AnyCell], Sequence[AnyCall]]
-    finish: Callable[[Settled[AnyCell, AnyCall]], Finished]
+    finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished]
 
 
 def collect(
@@ -90,14 +93,13 @@ def collect(
     entries: Iterable[Entry],
     cells: Sequence[AnyCell],
     calls: Callable[[AnyCell], Sequence[AnyCall]],
-    finish: Callable[[Settled[AnyCell, AnyCall]], Finished],
+    finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
     make: Callable[[Entry], Backend] = make_backend,
 ) -> Iterator[Finished]:
-    """Ask these participants what the ledger does not hold of the calls of these cells, under the study's budget; each
-    cell as it is finished.
+    """Ask participants for the calls that the ledger lacks, under the study's budget; yield each finished cell.
 
-    entries: all that the calls name. make: an entry's backend. What is raised, and what Ctrl-C does, is told at
-    `run_work`.
+    entries: all participants of the calls. make: returns an entry's backend. `run_work` documents exceptions and
+    Ctrl-C.
     """
     known = {entry.id: entry for entry in entries}
     with (
@@ -131,11 +133,11 @@ class _Asking:
             self.problems.append(error)
 
     async def one(self, participant: Participant, queue: deque[Request]) -> bool:
-        """Ask and record one request of the queue; False when there is nothing more to do."""
+        """Ask and record one request of the queue; return False if none is left."""
         if not queue or self.halted():
             return False
         request, name = queue.popleft(), participant.entry.id
-        allowed = Allowed(self.work.budget, self.stop, self.halted, self.writer.require)
+        allowed = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
         attempted = await attempt(participant, request, allowed)
         if attempted is None:
             return False
@@ -147,7 +149,7 @@ class _Asking:
         return True
 
     def halted(self) -> bool:
-        """Return whether no more calls are to be sent."""
+        """Return whether to stop sending calls."""
         return self.stop.is_set() or bool(self.problems)
 
     async def sync(self) -> None:
@@ -155,12 +157,12 @@ class _Asking:
             await asyncio.sleep(SYNC_S)
             try:
                 await self.writer.sync()
-            except TrapsError as error:  # a disk that cannot be synced stops new calls, as one that cannot be written
+            except TrapsError as error:  # a disk that cannot be synced stops new calls
                 self.problems.append(error)
                 return
 
     async def run(self) -> None:
-        """Ask all that is missing. An exception stops new calls; it is raised when those in flight are recorded."""
+        """Ask for all that is missing. An exception stops new calls; it is raised once calls in flight are recorded."""
         queues: dict[str, deque[Request]] = {}
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
@@ -178,8 +180,7 @@ class _Asking:
 
 
 class _Held(Mapping[str, Any]):
-    """A row of the ledger without its components, which are most of it and which the request holds too: half as large
-    as a dictionary, since all rows with the same columns share these."""
+    """A ledger row without its components, which the request holds too; half the size of a dictionary."""
 
     __slots__ = ("_places", "_values")
     _shared: ClassVar[dict[tuple[str, ...], dict[str, int]]] = {}
@@ -201,7 +202,7 @@ class _Held(Mapping[str, Any]):
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What the cells of an evaluation share: its one writer, the places in its ledger that were told of."""
+    """State that the cells of an evaluation share: its writer, and the ledger places already reported."""
 
     writer: Writer
     told: set[str]
@@ -209,27 +210,26 @@ class _Evaluation:
 
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
-) -> AsyncIterator[Settled[AnyCell, AnyCall]]:
-    """Settle the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out.
+) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
+    """Settle the cells of one evaluation, asking only for missing calls. Unfinished cells are left out.
 
-    Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
-    cells share (a steered control stands in two datasets) is found by the second.
+    Calls and rows are held one cell at a time; a call that two cells share (a steered control) is found by the second.
     """
     reported = set[str]()
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
         for cell in cells:
             settled = await _settle_cell(work, cell, _Evaluation(writer, reported), stop)
             if settled is None:
-                return  # what was answered is in the ledger
+                return  # finished answers are in the ledger
             yield settled
             del settled
-            await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
+            await asyncio.sleep(0)  # let the loop run calls of other cells after a fully known one
 
 
 async def _settle_cell(
     work: Work[AnyCell, AnyCall, Any], cell: AnyCell, its: _Evaluation, stop: asyncio.Event
-) -> Settled[AnyCell, AnyCall] | None:
-    """Ask what is missing of a cell; None if that was stopped."""
+) -> SettledCell[AnyCell, AnyCall] | None:
+    """Ask for a cell's missing calls; return None if that was stopped."""
     report = progress.current()
     calls = work.calls(cell)
     requests = {call.request.key: call.request for call in calls}
@@ -250,14 +250,14 @@ async def _settle_cell(
     await its.writer.sync()
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
-    return Settled(cell, calls, {key: rows[key] for key in requests}, tally)
+    return SettledCell(cell, calls, {key: rows[key] for key in requests}, tally)
 
 
 async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
-) -> AsyncIterator[Settled[AnyCell, AnyCall] | Exception]:
-    """Settle all cells, models side by side. A model that fails yields its exception; the others go on."""
-    done: asyncio.Queue[Settled[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
+) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
+    """Settle all cells, models in parallel. A failing model yields its exception; the others go on."""
+    done: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
@@ -289,7 +289,7 @@ async def settle(
                 open_tasks -= 1
             else:
                 yield settled
-                if isinstance(settled, Settled):
+                if isinstance(settled, SettledCell):
                     turn.release()
     finally:
         for task in tasks:
@@ -298,10 +298,10 @@ async def settle(
 
 
 def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -> Iterator[Finished]:
-    """Settle cells and finish each (write its table) just before it is handed on. For synchronous callers.
+    """Settle cells and finish each (write its table) just before it is yielded; for synchronous callers.
 
     The first Ctrl-C, SIGTERM or SIGHUP stops new calls and waits for those in flight, a second one stops at once;
-    either way KeyboardInterrupt is raised and the same command goes on later. A caller that closes the iterator early
+    either way KeyboardInterrupt is raised and the same command continues later. A caller that closes the iterator early
     stops it in the same way. Exceptions of models are raised together after the others have finished.
     """
     loop, stop = asyncio.new_event_loop(), asyncio.Event()
@@ -317,7 +317,7 @@ def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -
             except asyncio.CancelledError:
                 raise KeyboardInterrupt from None
             if stop.is_set():
-                continue  # drain: calls in flight are paid for and go to the ledger, no more tables are made
+                continue  # drain: calls in flight are paid for and go to the ledger, no more tables are built
             if isinstance(settled, Exception):
                 problems.append(settled)
             else:
@@ -343,7 +343,7 @@ async def _exhaust(results: AsyncIterator[Any]) -> None:
 
 
 def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
-    """Return one exception for all models that failed; sentences stay sentences."""
+    """Return one exception for all failed models; sentences stay sentences."""
     if problems and all(isinstance(problem, TrapsError) for problem in problems):
         kind = BudgetReached if any(isinstance(problem, BudgetReached) for problem in problems) else TrapsError
         raise kind("\n".join(sorted({str(problem) for problem in problems})))
@@ -354,10 +354,10 @@ def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
 
 
 class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
-    """Route the signals that stop a run to the stop event while a loop works in the main thread, then give them back.
+    """Route stop signals to the stop event while a loop works in the main thread, then restore the handlers.
 
-    A person who presses Ctrl-C can press it again; what sends SIGTERM or SIGHUP will end the process by force some time
-    later, so calls in flight get GRACE_S to come back. One that is given up stays reserved with its worst case.
+    A person who presses Ctrl-C can press it again; a sender of SIGTERM or SIGHUP will kill the process some time later,
+    so calls in flight get GRACE_S to finish. A call given up stays reserved with its worst case.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
@@ -374,7 +374,7 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
 
     def _interrupt(self, by: signal.Signals) -> None:
         if self._stop.is_set():
-            # What is cancelled now is in the ledger or stays reserved: how it ends is nobody's news.
+            # Calls cancelled now are in the ledger or stay reserved: do not report how they end.
             self._loop.set_exception_handler(lambda *_: None)
             self._loop.call_soon_threadsafe(self._cancel)
             end = threading.Timer(END_S, os._exit, (INTERRUPTED,))  # whatever still holds the process then

@@ -1,4 +1,4 @@
-"""The one place where a registry entry becomes a backend; a new backend is one more branch here."""
+"""The one place that creates a registry entry's backend; a new backend is one more branch here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from traps_pipeline.models.request import Backend
 
 
 def require_libraries(entry: Entry) -> None:
-    """Raise TrapsError with the line to type unless what this entry is asked through is installed."""
+    """Raise TrapsError with the command to type unless an entry's libraries are installed."""
     if entry.backend == NETWORK:
         require("api")
     if entry.backend == LOCAL:
@@ -21,7 +21,7 @@ def require_libraries(entry: Entry) -> None:
 def make_backend(entry: Entry) -> Backend:
     """Return the entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
 
-    Raises TrapsError when its library is not installed, its key is not set, or its weights are not here.
+    Raises TrapsError if its library is not installed, its key is not set, or its weights are missing.
     """
     require_libraries(entry)
     match entry.backend:

@@ -1,7 +1,7 @@
 """A cap that holds: the worst case of a call is reserved before it is sent.
 
-The reservation is a row of the ledger's database, and the call's own row takes its place (`ledger/money.py`). So calls
-in flight when a process is killed count as their worst case ever after, and all processes of a study share one budget.
+The reservation is a row of the ledger's database, and the call's own row replaces it (`ledger/money.py`). So calls in
+flight when a process is killed count as their worst case forever, and all processes of a study share one budget.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from functools import partial
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.money import Full, Money
+from traps_pipeline.ledger.money import CapExhausted, Money
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.study import Study
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
-LOOK_S = 0.5  # how often it is looked whether other processes have made room
+LOOK_S = 0.5  # how often to check whether other processes have freed room
 BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are shown arbitrary text
 
 
@@ -31,14 +31,14 @@ class BudgetReached(TrapsError):
 
 @dataclass(frozen=True)
 class Tokens:
-    """Tokens of a call at most."""
+    """The maximum tokens of a call."""
 
     prompt: int
     completion: int
 
 
 def most_tokens(entry: Entry, request: Request) -> Tokens:
-    """Return an upper bound of what a call takes."""
+    """Return an upper bound of a call's tokens."""
     frames = request.sent.n_frames if request.sent else 0
     each = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
     schema = json.dumps(request.params.get("response_format", ""))
@@ -47,7 +47,7 @@ def most_tokens(entry: Entry, request: Request) -> Tokens:
 
 
 def worst_case_usd(entry: Entry, request: Request) -> float:
-    """Return dollars that a call may cost at most; 0 where the price is unknown (a study must allow that)."""
+    """Return a call's maximum cost in dollars; 0 if the price is unknown (a study must allow that)."""
     if entry.prices is None:
         return 0.0
     tokens = most_tokens(entry, request)
@@ -55,7 +55,7 @@ def worst_case_usd(entry: Entry, request: Request) -> float:
 
 
 def check_money(study: Study, entry: Entry) -> None:
-    """Raise TrapsError unless the study allows what asking this participant may cost."""
+    """Raise TrapsError unless the study allows the possible cost of asking this participant."""
     if entry.backend != NETWORK:
         return
     if entry.prices is None:
@@ -73,7 +73,7 @@ def check_money(study: Study, entry: Entry) -> None:
 
 @dataclass(frozen=True)
 class Reservation:
-    """Dollars that a call may cost, from before it is sent until its row is stored."""
+    """A call's maximum dollars, held from before it is sent until its row is stored."""
 
     id: str
     participant: str
@@ -81,10 +81,10 @@ class Reservation:
 
 
 class Budget:
-    """What may still be spent, in all and by each participant that has a cap of its own.
+    """The remaining budget, in total and per participant with its own cap.
 
-    money: None where nobody who is asked has a price. accounts: by participant, the budget of its account where that
-    spans several studies.
+    money: None if nobody who is asked has a price. accounts: by participant, the budget of its account if that spans
+    several studies.
     """
 
     def __init__(
@@ -101,14 +101,13 @@ class Budget:
 
     @property
     def spent_usd(self) -> float:
-        """Dollars spent by all runs, calls in flight with their worst case."""
+        """Dollars spent by all runs, with the worst case of calls in flight."""
         return sum(self._money.spent().values()) if self._money else 0.0
 
     async def reserve(self, participant: str, worst_usd: float) -> Reservation | None:
-        """Reserve a call's worst case; None for a call that costs nothing. While calls in flight hold the room, wait
-        for what they really cost.
+        """Reserve a call's worst case; return None for a free call. Wait while calls in flight hold the room.
 
-        Raises BudgetReached when there is no room and nothing in flight that could make some, and TrapsError.
+        Raises BudgetReached if there is no room and no call in flight that could free some, and TrapsError.
         """
         if worst_usd <= 0:
             return None
@@ -136,7 +135,7 @@ class Budget:
                     await asyncio.wait_for(self._changed.wait(), LOOK_S)
 
     async def settle(self, reservation: Reservation | None, cost_usd: float | None) -> None:
-        """Put a call's cost in the place of its worst case; an unknown cost counts as the worst."""
+        """Replace a call's worst case by its cost; an unknown cost counts as the worst case."""
         if reservation is None:
             return
         cost = reservation.usd if cost_usd is None else cost_usd
@@ -155,20 +154,20 @@ class Budget:
         settled = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
         await asyncio.wrap_future(settled)
 
-    async def _may_make_room(self, full: Full) -> bool:
-        """Return whether calls are in flight, here or in another process, whose cost may be less than their worst."""
+    async def _may_make_room(self, full: CapExhausted) -> bool:
+        """Return whether calls in flight, of any process, may cost less than their worst case."""
         if any(full.slot in (None, its.participant) for its in self._in_flight.values()):
             return True
         assert self._money is not None, "what is full was asked for"
         return await asyncio.to_thread(self._money.is_any_alive, full.others)
 
     def _in_flight_through(self, account: AccountBudget) -> bool:
-        """Return whether calls of this process are out whose settling may make room in an account's budget."""
+        """Return whether this process has calls in flight whose settling may free an account's budget."""
         return any(self._accounts.get(its.participant) is account for its in self._in_flight.values())
 
 
 def reached(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
-    """Return why a budget leaves no room for a call; None: the study's."""
+    """Return why a budget leaves no room for a call. participant: None for the study's budget."""
     return (
         f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "
         f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"

@@ -1,7 +1,7 @@
-"""What a provider's own bytes say of an answer: one reader for each dialect.
+"""Read answers from providers' own bytes, with one reader per dialect.
 
-litellm builds and sends requests. Its view of a response is not read: it makes `stop` of every finish reason that it
-does not know, and loses refusals and parts.
+litellm builds and sends requests. Its view of a response is not used: it turns unknown finish reasons into `stop`, and
+loses refusals and parts.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from traps_pipeline.models.endings import Ending, ending_of
 
 Dialect = Literal["chat", "responses", "anthropic", "gemini"]
 Json = Mapping[str, Any]
-MOST_WORD = 200  # characters of what a provider says in a word: what answered, why it ended
+MOST_WORD = 200  # characters of a provider's short fields: served model, finish reason
 _NAMES: Mapping[Dialect, str] = {
     "chat": "OpenAI's chat API",
     "responses": "OpenAI's Responses API",
@@ -38,13 +38,16 @@ _PARTS: Mapping[str, tuple[str, str]] = {
 
 
 class OddShapeError(ValueError):
-    """A body that is no answer of its dialect; the message says what it is."""
+    """A body that is not an answer of its dialect; the message describes it."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer as its provider sent it. finish: the raw finish reason; usage: the raw counts; first_token:
-    log-probabilities of what may have been its first token, where it says any."""
+    """An answer as its provider sent it.
+
+    finish: the raw finish reason; usage: the raw counts; first_token: log-probabilities of alternatives for its first
+    token, if it gives any.
+    """
 
     text: str
     reasoning: str
@@ -57,7 +60,7 @@ class Reply:
 
 
 def dialect_of(provider_id: str) -> Dialect:
-    """Return the dialect of a route, the beginning of litellm's name for a model."""
+    """Return the dialect of a route, the prefix of litellm's name for a model."""
     route, _, model = provider_id.partition("/")
     if model.startswith("responses/"):
         return "responses"
@@ -79,7 +82,7 @@ def parse_body(content: bytes) -> Json:
 
 
 def shape_of(text: str) -> str:
-    """Return in words what a text that is no JSON is."""
+    """Return a description of a text that is no JSON."""
     start = text.lstrip("\ufeff \t\r\n")
     if not start:
         return "an empty body"
@@ -106,14 +109,14 @@ def read_reply(body: Json, provider_id: str) -> Reply:
 
 @dataclass
 class _Texts:
-    """The texts of an answer's parts, each list in their order."""
+    """The texts of an answer's parts, in order, by kind."""
 
     text: list[str] = field(default_factory=list)
     reasoning: list[str] = field(default_factory=list)
     refusal: list[str] = field(default_factory=list)
 
     def add(self, parts: Any, into: str | None = None) -> None:
-        """Take a content: a text, or a list of parts. into: the field that takes all of it."""
+        """Add a content: a text, or a list of parts. into: the field that receives all of it."""
         if isinstance(parts, str):
             getattr(self, into or "text").append(parts)
             return
@@ -127,7 +130,7 @@ class _Texts:
                 self.add(part[name], into or kind)
 
     def reply(self, finish: Any, served_model: Any, usage: Any) -> Reply:
-        """Return the answer. Raises OddShapeError where it does not say why it ended."""
+        """Return the answer. Raises OddShapeError if it lacks a finish reason."""
         if not finish or not isinstance(finish, str):
             raise OddShapeError("it gives no finish reason, which each complete answer has")
         return Reply(
@@ -183,7 +186,7 @@ def _gemini(body: Json) -> Reply:
         if isinstance(part, dict) and isinstance(part.get("text"), str):
             texts.add(part["text"], "reasoning" if part.get("thought") is True else "text")
     reply = texts.reply(blocked or candidate.get("finishReason"), body.get("modelVersion"), body.get("usageMetadata"))
-    return reply if not blocked else replace(reply, ending="refused")  # whatever the reason: nothing was generated
+    return reply if not blocked else replace(reply, ending="refused")  # nothing was generated, for any reason
 
 
 _READERS: Mapping[Dialect, Callable[[Json], Reply]] = {
@@ -214,5 +217,5 @@ def _text_of(holder: Json, name: str) -> str:
 
 
 def storable(text: str) -> str:
-    """Return a text without halves of surrogate pairs, which a cut inside an emoji leaves and no file takes."""
+    """Return a text without unpaired surrogates, which a cut inside an emoji leaves and no file can store."""
     return text.encode("utf-8", "replace").decode("utf-8")

@@ -1,7 +1,7 @@
-"""Why an answer ended, in the words of providers: each finish reason that their documentation names, and what it means.
+"""The finish reasons that providers document, and the meaning of each.
 
-A reason that does not stand here is never an answer. Gateways pass the reasons of other providers on, in any case, so
-one list serves all dialects.
+An unlisted reason is never an answer. Gateways pass on the reasons of other providers, in any case, so one list serves
+all dialects.
 """
 
 from __future__ import annotations
@@ -47,5 +47,5 @@ _ENDINGS: Mapping[str, Ending] = {reason: ending for ending, reasons in _REASONS
 
 
 def ending_of(reason: str | None) -> Ending:
-    """Return what a finish reason means; `unknown` for one that no documentation names."""
+    """Return the meaning of a finish reason; `unknown` for an undocumented one."""
     return _ENDINGS.get((reason or "").strip().lower(), "unknown")

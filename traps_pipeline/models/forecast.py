@@ -1,6 +1,6 @@
-"""What new calls will take: tokens, dollars and minutes of each participant that is asked over the network.
+"""Forecast tokens, dollars and minutes of new network calls, by participant.
 
-Experience comes first: means over what the ledger holds of a participant. Without any, the registry's estimates stand.
+Means over a participant's ledger rows come first; without any, the registry's estimates apply.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answe
 # Of an entry without `expected_latency_s`: seconds to the first token of an answer, and completion tokens a second.
 FIRST_TOKEN_S, TOKENS_A_S = 4.0, 60.0
 TYPICAL_BYTES_A_TOKEN = 4
-LOW_SHARE = 0.4  # of the expected completion: what a terse model takes
+LOW_SHARE = 0.4  # share of the expected completion that a terse model takes
 
 
 @dataclass(frozen=True)
 class Experience:
-    """Means over answered calls: tokens of prompt and completion, seconds. None where nothing is known."""
+    """Means over answered calls: tokens of prompt and completion, seconds. None if nothing is known."""
 
     prompt_tokens: float | None = None
     completion_tokens: float | None = None
@@ -31,8 +31,11 @@ class Experience:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What calls take. Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0. minutes:
-    of these calls alone; paced_minutes: that the pace of their account asks for, which all calls to it share."""
+    """The predicted cost of calls.
+
+    Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0. minutes: of these calls alone;
+    paced_minutes: at the pace of their account, which all its calls share.
+    """
 
     participant: str
     calls: int
@@ -42,11 +45,11 @@ class Forecast:
     minutes: float
     account: str
     paced_minutes: float
-    batch_price: float = 1.0  # of a call in a batch, relative to a live one
+    batch_price: float = 1.0  # cost of a batch call, relative to a live one
 
 
 def experience(totals: Iterable[Totals]) -> Experience:
-    """Return what the ledgers' rows of one participant say."""
+    """Return means over one participant's ledger rows."""
     joined = Totals()
     for part in totals:
         joined.join(part)
@@ -54,8 +57,9 @@ def experience(totals: Iterable[Totals]) -> Experience:
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
-    """Return what so many new calls to an entry take. The high end is each call's worst case, which a budget
-    reserves.
+    """Return the forecast of a number of new calls to an entry.
+
+    The high end is each call's worst case, which a budget reserves.
     """
     frames, most_frames = _clip_tokens(entry)
     prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
@@ -86,8 +90,7 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
-    """Return minutes of calls that are made side by side: those of the slowest participant, or of the account whose
-    pace its participants share."""
+    """Return minutes of parallel calls: those of the slowest participant, or of a shared account's pace."""
     rows, shared = list(forecasts), dict[str, float]()
     for row in rows:
         shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes
@@ -95,7 +98,7 @@ def minutes_of(forecasts: Iterable[Forecast]) -> float:
 
 
 def _clip_tokens(entry: Entry) -> tuple[float, float]:
-    """Return the prompt tokens of a clip: expected, and at most."""
+    """Return the prompt tokens of a clip: expected, and maximum."""
     if not isinstance(entry, ModelEntry) or entry.media is None:
         return 0.0, 0.0
     most = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)

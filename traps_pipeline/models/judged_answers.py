@@ -1,4 +1,4 @@
-"""Correctness by code: an extracted value against the ground truth (docs/spec.md 4.3)."""
+"""Decide correctness by code: compare an extracted value with the ground truth (docs/spec.md 4.3)."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from typing import Any
 
 from traps_pipeline.models.thinking import strip_fence
 
-UNREAD = "unread"  # the vote of a rule judge, and the outcome of an answer, that has none of the forms the rules read
+UNREAD = "unread"  # a rule judge's vote, and an answer's outcome, if no rule can read the text
 NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
 _FENCE = re.compile(r"(?:```|~~~)?\s*(?:json)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
-# Punctuation that is kept: a hyphen or point inside a number or range, a minus or point that begins a number.
+# Kept punctuation: a hyphen or point inside a number or range, a minus or point before a number.
 _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
 def normalise(text: str) -> str:
-    """Return the text in lower case with single spaces, without articles and punctuation except that of numbers and
-    ranges."""
+    """Return the text in lower case with single spaces, without articles and punctuation.
+
+    Punctuation of numbers and ranges stays.
+    """
     text = _THOUSANDS.sub("", re.sub("[–—−]", "-", text.lower()))
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
     text = _PUNCTUATION.sub(lambda match: " " if match[1] else match[0], text)
@@ -30,7 +32,7 @@ def normalise(text: str) -> str:
 
 
 def read_object(text: str) -> dict[str, Any] | None:
-    """Return the JSON object that a text is, in a fence or not; None if it is none, or holds a key twice."""
+    """Return the JSON object of a text, in a fence or not; None if it is none, or repeats a key."""
     try:
         parsed = json.loads(strip_fence(text), object_pairs_hook=_unique)
     except (ValueError, RecursionError):
@@ -39,10 +41,10 @@ def read_object(text: str) -> dict[str, Any] | None:
 
 
 def leading_object(text: str) -> str:
-    """Return the JSON object that a text begins with, in a fence or not, without the prose after it.
+    """Return the JSON object at the beginning of a text, in a fence or not, without the prose after it.
 
-    The text comes back as it is if it begins with no whole object, or if another brace follows: of two verdicts none
-    is the judge's.
+    The text is returned unchanged if it begins with no complete object, or if another brace follows: of two verdicts
+    neither is the judge's.
     """
     start = text.find("{")
     if start < 0 or _FENCE.fullmatch(text[:start].strip()) is None:
@@ -62,12 +64,12 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_flag(value: object) -> object:
-    """Return a truth value that JSON states as a word (`"true"`) as one; anything else as it is."""
+    """Return a truth value that JSON states as a word (`"true"`) as a bool; anything else unchanged."""
     return {"true": True, "false": False}.get(value.strip().lower(), value) if isinstance(value, str) else value
 
 
 def to_number(text: str) -> float | None:
-    """Return the number that a value contains, in digits or as a word; None if it contains none or several."""
+    """Return the only number in a value, in digits or as a word; None if it contains none or several."""
     words = [NUMBER_WORDS.get(word, word) for word in normalise(text).split()]
     numbers = _NUMBER.findall(" ".join(words))
     return float(numbers[0]) if len(numbers) == 1 else None
@@ -83,8 +85,10 @@ def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> st
 def is_correct(
     extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
 ) -> bool:
-    """Return whether a value is correct: a number within 0.5 of the ground truth, or a name or alias of the true label.
-    A value that maps to no label is wrong."""
+    """Return whether a value is correct: a number within 0.5 of the ground truth, or a name of the true label.
+
+    Aliases count as names. A value that matches no label is wrong.
+    """
     if extracted is None:
         return False
     if answer_type == "numeric":

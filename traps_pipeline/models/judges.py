@@ -1,5 +1,7 @@
-"""Who a judge is: `assets/judges.yaml`, its panels, and what a judge is told to return. What a panel does with its
-votes stands in `judging/`."""
+"""The registry of judges and panels (`assets/judges.yaml`), with their prompts and schemas.
+
+`judging/` collects and counts a panel's votes.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import read_mapping
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import (
     JUDGE_PROTOCOL,
@@ -27,28 +29,28 @@ from traps_pipeline.models.registry import (
     read_entries,
     with_own,
 )
-from traps_pipeline.models.schemas import structured
+from traps_pipeline.models.schemas import structured_output
 from traps_pipeline.models.thinking import Marks
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
 RULE = "rule"  # the backend of the rule judges
-RULES_VERSION = 6  # of judging/rules.py; when it is raised, rule judges vote again
+RULES_VERSION = 6  # version of judging/rules.py; raise it to make rule judges vote again
 RULES_PANEL = "rules"
-ONE_JUDGE = ".1"  # ends the id of a panel of one judge
+ONE_JUDGE = ".1"  # suffix of the id of a panel of one judge
 BY_RULES = "judged by rules, not comparable"
 Task = Literal["abstention", "correctness"]
 
 
-# What a judge over the network is told to return; what it does return is checked by `judging.panel` all the same.
+# The schema that a network judge is asked for; `judging.panel` checks its answer all the same.
 _ABSTENTION: Mapping[str, Any] = {
     "abstained": {"type": "boolean"},
     "confidence": {"type": "string", "enum": ["high", "medium", "low"]},
     "reasoning": {"type": "string"},
 }
 SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
-    "abstention": structured("abstention", **_ABSTENTION),
-    "correctness": structured(
+    "abstention": structured_output("abstention", **_ABSTENTION),
+    "correctness": structured_output(
         "correctness",
         correct={"type": "boolean"},
         extracted_value={"anyOf": [{"type": "string"}, {"type": "number"}, {"type": "null"}]},
@@ -57,30 +59,30 @@ SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
 }
 
 
-_WITH_PREMISE = structured("abstention", **_ABSTENTION, rejects_premise={"type": "boolean"})
+_WITH_PREMISE = structured_output("abstention", **_ABSTENTION, rejects_premise={"type": "boolean"})
 
 
 class Judge(typing.Protocol):
-    """What of a judge decides its votes, wherever it is described."""
+    """The properties of a judge that decide its votes, wherever it is defined."""
 
     @property
     def id(self) -> str:
-        """Its name."""
+        """The judge's name."""
         ...
 
     @property
     def backend(self) -> str:
-        """Kind of backend."""
+        """The kind of backend."""
         ...
 
     @property
     def endpoint(self) -> str:
-        """What answers."""
+        """The model that answers, in the ledger key."""
         ...
 
     @property
     def params(self) -> Mapping[str, Any]:
-        """What is sent besides the prompts."""
+        """The parameters sent besides the prompts."""
         ...
 
     @property
@@ -90,12 +92,12 @@ class Judge(typing.Protocol):
 
     @property
     def premise(self) -> bool:
-        """Whether it also says if an answer rejects the premise of the question."""
+        """Whether it also says if an answer rejects the question's premise."""
         ...
 
 
 def vote_prompt(seat: Judge, task: Task) -> str:
-    """Return the system prompt of a task: the paper's, with ours about the premise for a judge that is asked for it."""
+    """Return the system prompt of a task: the paper's, with our part about the premise if the judge is asked for it."""
     text = prompt(f"judge_{task}")
     return f"{text}\n\n{prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
@@ -109,7 +111,7 @@ class JudgeEntry(Entry):
     """One judge of `assets/judges.yaml`."""
 
     backend: Literal["rule", "api"]  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
-    premise: bool = False  # whether it also says if an answer rejects the premise of the question; the paper's do not
+    premise: bool = False  # whether it also says if an answer rejects the question's premise; the paper's judges do not
     limits: Limits = Limits(concurrency=12)
 
     @model_validator(mode="before")
@@ -123,7 +125,7 @@ class JudgeEntry(Entry):
         return JUDGE_PROTOCOL
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Return judges by id. Raises TrapsError naming judge and field."""
@@ -137,10 +139,10 @@ def thinking_of(judge: str) -> Marks | None:
     return entry.thinking if entry else None
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
-    """Return the judges of a panel: three, or one. Raises TrapsError naming the file and what is wrong."""
+    """Return the judges of a panel: three, or one. Raises TrapsError naming the file and the problem."""
     panels, judges = load_panels(path), load_judges(path)
     if not name:
         raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
@@ -157,15 +159,15 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
-    """Return the seats of every panel by name, unchecked. Raises TrapsError if the file has no mapping `panels:`."""
+    """Return the judges of every panel by name, unchecked. Raises TrapsError if the file has no mapping `panels:`."""
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
-    return {**panels, **own.together().panels} if path == JUDGES_FILE else panels
+    return {**panels, **user_registry.together().panels} if path == JUDGES_FILE else panels
 
 
 def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
-    """Return what to do where no panel is named, in words."""
+    """Return instructions for a command without a panel."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
         f"({RULES_PANEL} is for reference models)"
@@ -173,8 +175,10 @@ def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
 
 
 def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
-    """Raise TrapsError where no panel is named, where it is unknown, and where rules would judge other models than
-    reference models although nobody said so."""
+    """Raise TrapsError if no panel is named, if it is unknown, or if rules would judge unasked.
+
+    Rules judge models other than reference models only if the user says so.
+    """
     load_panel(panel)
     others = [model for model in models if not is_reference(model)]
     if panel == RULES_PANEL and others and not judged_by_rules:
@@ -187,12 +191,12 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 
 def panel_version(panel: str) -> str:
-    """Return the version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
-    return version_of_seats(load_panel(panel)) if panel else "no panel is named"
+    """Return the version of everything that decides a panel's votes besides answers: judges, prompts, schemas."""
+    return version_of_judges(load_panel(panel)) if panel else "no panel is named"
 
 
-def version_of_seats(seats: Iterable[Judge]) -> str:
-    """Return the version of what these judges decide."""
+def version_of_judges(seats: Iterable[Judge]) -> str:
+    """Return the version of these judges, with their prompts and schemas."""
     judges = list[list[Any]]()
     for seat in seats:
         more = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []
@@ -201,14 +205,13 @@ def version_of_seats(seats: Iterable[Judge]) -> str:
 
 
 def panel_id(panel: str) -> str:
-    """Return what stands for a panel in the rows that it decided: its name and the version of its judges, and a mark
-    where it is a single judge."""
-    return id_of_seats(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
+    """Return a panel's id in rows: its name and the version of its judges, with a mark for a single judge."""
+    return id_of_judges(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
 
 
-def id_of_seats(name: str, seats: Sequence[Judge]) -> str:
-    """Return what stands for a panel of this name and these judges."""
-    return f"{name}@{version_of_seats(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
+def id_of_judges(name: str, seats: Sequence[Judge]) -> str:
+    """Return the id of a panel of this name and these judges."""
+    return f"{name}@{version_of_judges(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
 
 
 def panel_names(panels: str) -> list[str]:
@@ -216,6 +219,6 @@ def panel_names(panels: str) -> list[str]:
     return [one.partition("@")[0] for one in panels.split("+") if one]
 
 
-def by_rules(panels: str, model: str) -> bool:
-    """Return whether rules judged a model that they are not made for, by the column `panel` of a row."""
+def is_judged_by_rules(panels: str, model: str) -> bool:
+    """Return whether rules judged a model that is no reference model, by the column `panel` of a row."""
     return RULES_PANEL in panel_names(panels) and not is_reference(model)

@@ -1,6 +1,6 @@
-"""How many prompt tokens a provider counts for the frames of a clip, as it publishes or as was measured at it.
+"""Expected prompt tokens of a clip's frames, by provider, as documented or measured.
 
-These are expected numbers, for `traps plan`; what a budget reserves is an entry's `tokens_per_frame`, an upper bound.
+`traps plan` uses them; a budget reserves an entry's `tokens_per_frame`, an upper bound.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ STAMP = 8  # Qwen3-VL: the time before two frames, and the marks around them
 
 
 def openai_frame(model: str, size: Size) -> float | None:
-    """Return an image at detail auto or high: tiles of 512 pixels, or patches of 32, by the model; None for a model
-    that is not OpenAI's. Frames are small enough not to be scaled down, and are not enlarged.
+    """Return the tokens of an image at detail auto or high; None for a model that is not OpenAI's.
+
+    They count tiles of 512 pixels, or patches of 32, by the model. Frames are small enough not to be scaled down, and
+    are not enlarged.
 
     https://platform.openai.com/docs/guides/images-vision (calculating costs). It says 1.62 tokens a patch of
     gpt-5-mini; 1.20 were measured at the API with six sizes (OpenAI Developer Community, "GPT-5-mini image input token
@@ -39,7 +41,7 @@ def openai_frame(model: str, size: Size) -> float | None:
 
 
 def gemini_frame(model: str, size: Size, profile: Profile) -> float:
-    """Return a frame that Gemini samples of a video, or an image, at the default media resolution.
+    """Return the tokens of a video frame that Gemini samples, or of an image, at the default media resolution.
 
     Up to Gemini 2.5: 258 tokens a frame (that is 258 a second at one frame a second), and 258 an image of at most 384
     pixels, or each tile of 768 (https://ai.google.dev/gemini-api/docs/tokens). Gemini 3: 70 a frame and 1,120 an image
@@ -52,21 +54,24 @@ def gemini_frame(model: str, size: Size, profile: Profile) -> float:
 
 
 def anthropic_frame(size: Size) -> float:
-    """Return an image of at most 1,568 pixels on its long edge: its area by 750
-    (https://docs.anthropic.com/en/docs/build-with-claude/vision)."""
+    """Return the tokens of an image of at most 1,568 pixels on its long edge: its area divided by 750.
+
+    https://docs.anthropic.com/en/docs/build-with-claude/vision
+    """
     return size[0] * size[1] / 750
 
 
 def qwen3_vl_frame(size: Size, profile: Profile) -> float:
-    """Return cells of 32 pixels, whole in each direction; two frames of a video share theirs and have a time before
-    them (the model's own processor, as transformers has it)."""
+    """Return the tokens of a frame: cells of 32 pixels, rounded up in each direction.
+
+    Two frames of a video share their cells and have a time before them (the model's own processor in transformers).
+    """
     cells = round(size[0] / 32) * round(size[1] / 32)
     return (cells + STAMP) / 2 if profile == "video" else cells + 2
 
 
 def expected_clip_tokens(entry: ModelEntry) -> float:
-    """Return the prompt tokens of a whole clip. For a provider or model that is not known here, the entry's
-    `tokens_per_frame`."""
+    """Return the prompt tokens of a whole clip; for an unknown model the entry's `tokens_per_frame`."""
     media = entry.media
     if media is None:
         return 0.0

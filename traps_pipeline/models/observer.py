@@ -6,7 +6,7 @@ import asyncio
 from functools import lru_cache
 from pathlib import Path
 
-from traps_pipeline.models.framing import observed
+from traps_pipeline.models.framing import observer_frames
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
@@ -14,20 +14,20 @@ from traps_pipeline.video.policies import FramePolicy
 
 
 @lru_cache(maxsize=100_000)
-def seen(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
-    """Return what the observer says of these frames of a clip; one look serves all regimes and runs."""
+def observer_answer(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
+    """Return the observer's answer from these frames of a clip, cached for all regimes and runs."""
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question, frames)
 
 
 class ObserverBackend:
-    """Looks at the clip with classical vision; sees neither the record nor the simulator."""
+    """Answers by classical vision on the clip; sees neither the record nor the simulator."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt; see `Backend`."""
+        """Return the outcome of one attempt; see `Backend`."""
         assert request.media is not None, "the observer is asked about clips"
-        frames = observed(dataset_of(str(request.about["item_id"])))
-        answer = await asyncio.to_thread(seen, request.media_digest, request.media, request.user, frames)
+        frames = observer_frames(dataset_of(str(request.about["item_id"])))
+        answer = await asyncio.to_thread(observer_answer, request.media_digest, request.media, request.user, frames)
         text = phrase(answer, request)
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)

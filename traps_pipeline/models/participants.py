@@ -1,6 +1,6 @@
-"""Who is asked, and one call to it: its connections, its account's pace, its retries, its reservation, its row.
+"""Send one call to a participant: its connections, its account's pace, retries, reservation and ledger row.
 
-The one place where a call is sent; `models/ask.py` says which calls.
+This is the one place that sends calls; `models/ask.py` decides which.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.rows import ASIDES
+from traps_pipeline.ledger.rows import SIDE_TEXTS
 from traps_pipeline.models.budget import Budget, BudgetReached, Reservation, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
 from traps_pipeline.models.request import (
@@ -37,14 +37,14 @@ from traps_pipeline.storage.study import Study
 
 Row = Mapping[str, Any]
 MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
-MALFORMED_TRIES = 2  # each is paid for, and a provider whose answers are out of order seldom mends itself
-FILES = 256  # open besides connections: segments, tables, Dagster's history, the interpreter's own
-OVERRUN = 16  # times its worst case: what a call is believed to have cost at most
+MALFORMED_TRIES = 2  # each is paid for, and a provider with malformed answers seldom recovers
+FILES = 256  # open files besides connections: tables, Dagster's history, the interpreter's own
+OVERRUN = 16  # highest plausible cost, in worst cases
 
 
 @dataclass(frozen=True)
 class Participant:
-    """A model or judge as it is asked: its backend and entry, its connections, its account's pace, its failures."""
+    """A model or judge with its backend, entry, connections, account pace and failures."""
 
     backend: Backend
     entry: Entry
@@ -54,8 +54,10 @@ class Participant:
 
 
 def allow_connections(count: int) -> None:
-    """Let this process hold so many connections open besides its files. Raises TrapsError where the shell does not
-    allow it: an answer that is paid for could not be stored."""
+    """Raise this process's limit of open files to allow so many connections.
+
+    Raises TrapsError if the shell forbids it: a paid answer could not be stored.
+    """
     needed = count + FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
@@ -69,9 +71,11 @@ def allow_connections(count: int) -> None:
 
 
 class Participants:
-    """Participants by id, made when first asked: one that is not asked needs neither key nor budget. Connections are
-    shared by all evaluations of a run, the pace by all participants of an account. sharers: how many processes ask
-    through an account, where hosts share it."""
+    """Participants by id, created on first use, so that an unused one needs neither key nor budget.
+
+    All evaluations of a run share connections, and all participants of an account its pace. sharers: how many processes
+    use an account, if hosts share it.
+    """
 
     def __init__(
         self,
@@ -111,11 +115,11 @@ class Participants:
 
 
 @dataclass(frozen=True)
-class Allowed:
-    """What a call needs besides its participant, one value a call.
+class CallContext:
+    """A call's context besides its participant, one value per call.
 
-    stop: set when the run is to end. halted(): no more calls are to be sent. require(): raises TrapsError when nobody
-    but another process may send this one. paid_by: is given the reservations of attempts that cost something.
+    stop: set when the run is to end. halted(): whether to stop sending calls. require(): raises TrapsError if only
+    another process may send this one. paid_by: receives the reservations of attempts that cost something.
     """
 
     budget: Budget
@@ -125,11 +129,13 @@ class Allowed:
     paid_by: list[Reservation] = field(default_factory=list)
 
 
-async def attempt(participant: Participant, request: Request, allowed: Allowed) -> tuple[Outcome, int, float] | None:
-    """Return an outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
+async def attempt(
+    participant: Participant, request: Request, allowed: CallContext
+) -> tuple[Outcome, int, float] | None:
+    """Return an outcome, the number of attempts, the last one's seconds; None if halted before anything was spent.
 
-    The one retry layer: exponential with full jitter, and never sooner than the provider asks. The outcome's cost holds
-    what attempts before it may have cost.
+    This is the one retry layer: exponential backoff with full jitter, and never sooner than the provider asks. The
+    outcome's cost includes what earlier attempts may have cost.
     """
     limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
     lost_usd, seconds, malformed = 0.0, 0.0, 0
@@ -144,7 +150,7 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
             except TransientError as error:
                 failure, seconds = error, time.monotonic() - began
             except BudgetReached:
-                if lost_usd:  # first what was lost goes into the ledger; the next call meets the cap again
+                if lost_usd:  # record lost money in the ledger first; the next call meets the cap again
                     return _given_up("budget", number - 1, seconds, lost_usd)
                 raise
             else:
@@ -155,7 +161,7 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
                 return outcome, number, time.monotonic() - began
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
-        if failure.kind == UNREACHABLE and not lost_usd:  # what may be billed goes into the ledger first
+        if failure.kind == UNREACHABLE and not lost_usd:  # record what may be billed in the ledger first
             participant.breaker.no_connection(failure.why)
         elif failure.kind != UNREACHABLE:
             participant.breaker.connected()
@@ -175,8 +181,7 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
 def _given_up(
     kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
 ) -> tuple[Outcome, int, float] | None:
-    """Return a failure for the ledger; None for a call that was never sent, or that cost nothing and will be made
-    again."""
+    """Return a failure for the ledger; None for a call that was never sent, or that was free and will be retried."""
     if kind in ("interrupted", "budget") and not lost_usd:
         return None
     if kind == MALFORMED:
@@ -184,12 +189,12 @@ def _given_up(
     return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
 
 
-async def _send(participant: Participant, request: Request, allowed: Allowed) -> Outcome:
-    """Return one attempt under a reservation. Raises TransientError and BudgetReached, and TrapsError before it is
-    sent.
+async def _send(participant: Participant, request: Request, allowed: CallContext) -> Outcome:
+    """Send one attempt under a reservation and return its outcome.
 
-    A call costs its worst case from the moment that bytes of it are handed to a server until the provider says
-    otherwise, and in a way that can be believed: one that timed out may be billed. One that never left costs nothing.
+    Raises TransientError and BudgetReached, and TrapsError before it is sent. A call costs its worst case from the
+    moment that bytes of it are handed to a server until the provider credibly says otherwise: one that timed out may be
+    billed. A call that was never sent is free.
     """
     entry = participant.entry
     worst_usd = worst_case_usd(entry, request)
@@ -197,7 +202,7 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
     cost_usd = 0.0
     with watching() as exchange:
         try:
-            # Last of all: waiting for a connection, the pace or the budget may have taken long, and a host may have
+            # Check last: waiting for a connection, the pace or the budget may have taken long, and a host may have
             # slept.
             await allowed.require()
             cost_usd = worst_usd
@@ -216,7 +221,7 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
             cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise
         finally:
-            if exchange.never_left:  # a call that is cancelled before it is sent, too
+            if exchange.never_left:  # also for a call that is cancelled before it is sent
                 cost_usd = 0.0
             if reservation is not None and cost_usd > 0:
                 allowed.paid_by.append(reservation)
@@ -224,9 +229,11 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:
-    """Return a cost that a backend read of an answer; the worst case where it is unknown or cannot be. A provider that
-    did not hold to the limits of a call is believed to have charged for more, up to a bound: a number of tokens that
-    nobody can have made would else end the study."""
+    """Return an answer's cost as read by a backend; the worst case if it is unknown or impossible.
+
+    A provider may exceed a call's limits and charge for it, up to a bound: an impossible number of tokens would
+    otherwise end the study.
+    """
     if cost_usd is None or not math.isfinite(cost_usd) or cost_usd < 0:
         return worst_usd
     return min(cost_usd, OVERRUN * worst_usd)
@@ -241,12 +248,11 @@ async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
 def ledger_row(
     request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
 ) -> tuple[Row, dict[str, str]]:
-    """Return the row that stands for an answer, and what is kept beside it: its reasoning trace, an answer out of
-    order."""
+    """Return the row of an answer, and its side texts: the reasoning trace, a malformed answer."""
     fields = asdict(outcome)
-    beside = {name: text for name in ASIDES if (text := fields.pop(name)) is not None}
+    beside = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
     if fields["first_token"] is None:
-        del fields["first_token"]  # few calls have it, and each row is stored
+        del fields["first_token"]  # few calls have it, so it is left out otherwise
     row = {
         "key": request.key,
         "outcome": fields.pop("kind"),
@@ -259,5 +265,5 @@ def ledger_row(
 
 
 def when_asked(row: Row) -> Row:
-    """Return the columns of every table made from a ledger that say when a row's call was asked."""
+    """Return the columns that say when a row's call was asked, in every table made from a ledger."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

@@ -20,7 +20,7 @@ _SCHEMA_PARTS = {
 
 @cache
 def prompt(name: str) -> str:
-    """Return text of `assets/prompts/<name>.txt`, stripped."""
+    """Return the text of `assets/prompts/<name>.txt`, stripped."""
     path = PROMPTS / f"{name}.txt"
     try:
         text = path.read_text(encoding="utf-8").strip()
@@ -33,7 +33,7 @@ def prompt(name: str) -> str:
 
 @cache
 def system_prompt(regime: str, dataset: str = "") -> str:
-    """Return the regime's system prompt, in a dataset that may vary it: parts stripped and joined by one blank line."""
+    """Return the regime's system prompt, in a dataset that may vary it: its parts joined by one blank line."""
     varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
     return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *varied))
 
@@ -51,6 +51,8 @@ def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
 
 
 def states_prompt(system: str, name: str) -> str:
-    """Return the system prompt under which states are read: the VQA prompt of that name, or the benchmark's own (system
-    `benchmark`)."""
+    """Return the system prompt for hidden states: the VQA prompt of that name, or the benchmark's own.
+
+    system: `benchmark` for the latter.
+    """
     return system_prompt(name) if system == "benchmark" else vqa_prompt(name)

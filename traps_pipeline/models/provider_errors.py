@@ -1,5 +1,7 @@
-"""What a provider says when it does not answer: its error object, with whatever HTTP status it comes, and how long it
-asks to wait. One reader for OpenAI, Anthropic, Gemini and the proxies and servers that copy them."""
+"""Read a provider's error object, with whatever HTTP status it comes, and its requested waiting time.
+
+One reader serves OpenAI, Anthropic, Gemini and the proxies and servers that copy them.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +42,12 @@ _UNIT_S = {"h": 3600.0, "m": 60.0, "s": 1.0, "ms": 0.001}
 
 @dataclass(frozen=True)
 class ProviderError:
-    """An error object. status: the HTTP status that it carries or stands for, None if its words are unknown; words:
-    codes and types, as the provider has them; details: what belongs to it besides; is_beside_answer: whether the body
-    holds choices or a usage, too, so that something was generated."""
+    """An error object.
+
+    status: the HTTP status that it carries or stands for, None if unknown; words: the provider's codes and types;
+    details: other fields; is_beside_answer: whether the body also holds choices or a usage, so that something was
+    generated.
+    """
 
     message: str
     words: tuple[str, ...] = ()
@@ -52,12 +57,12 @@ class ProviderError:
 
     @property
     def is_filtered(self) -> bool:
-        """Whether it refuses the content: a filter, a policy or a moderation stopped the call."""
+        """Whether a filter, a policy or a moderation refused the content."""
         return any(_FILTERED.search(word) for word in self.words) or any("flagged_input" in one for one in self.details)
 
     @property
     def is_about_key(self) -> bool:
-        """Whether a 401 or 403 with it is about the key, as far as its words say; so it is where they say nothing."""
+        """Whether a 401 or 403 with it is about the key, which is also assumed without words."""
         text = " ".join((self.message, *self.words)).replace("_", " ")
         return not text.strip() or bool(_ABOUT_KEY.search(text))
 
@@ -69,7 +74,7 @@ class ProviderError:
 
 
 def read_error(content: bytes | None) -> ProviderError | None:
-    """Return the error object in a body; None where it holds none, or is no JSON."""
+    """Return the error object in a body; None if it holds none, or is no JSON."""
     try:
         body = json.loads(content or b"null")
     except (ValueError, RecursionError):
@@ -90,7 +95,7 @@ def read_error(content: bytes | None) -> ProviderError | None:
 
 
 def _is_flat(body: Mapping[str, Any]) -> bool:
-    """Return whether a body is an error object itself: a message with a code, and nothing that an answer has."""
+    """Return whether a body itself is an error object: a message with a code, and no field of an answer."""
     return (
         isinstance(body.get("message"), str)
         and "code" in body
@@ -99,7 +104,7 @@ def _is_flat(body: Mapping[str, Any]) -> bool:
 
 
 def _of_choice(choices: Any) -> Any:
-    """Return the error that stands in the place of a choice, as OpenRouter sends it."""
+    """Return an error in the place of a choice, as OpenRouter sends it."""
     first = choices[0] if isinstance(choices, list) and choices else None
     return first.get("error") if isinstance(first, Mapping) else None
 
@@ -122,7 +127,7 @@ def _words(error: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _status(error: Mapping[str, Any]) -> int | None:
-    """Return the status that an error object carries as a number, else the one that its words stand for."""
+    """Return an error object's numeric status, or the status that its words stand for."""
     words = list(_words(error))
     numbers = [int(word) for word in words if re.fullmatch(r"[45]\d\d", word)]
     known = [_STATUS_OF[word.lower()] for word in words if word.lower() in _STATUS_OF]
@@ -133,10 +138,10 @@ def _status(error: Mapping[str, Any]) -> int | None:
 
 
 def retry_after_s(headers: Mapping[str, str], error: ProviderError | None = None) -> float | None:
-    """Return the seconds that a provider asks to wait; None if it does not say so.
+    """Return the seconds that a provider asks to wait; None if it does not say.
 
-    Read in this order: `retry-after-ms`, `retry-after` (seconds, "7s", a date), Gemini's RetryInfo, and when the limits
-    that are used up begin anew (`x-ratelimit-reset-*`, `anthropic-ratelimit-*-reset`).
+    Read in this order: `retry-after-ms`, `retry-after` (seconds, "7s", a date), Gemini's RetryInfo, and the reset times
+    of exhausted limits (`x-ratelimit-reset-*`, `anthropic-ratelimit-*-reset`).
     """
     named = {name.lower(): value.strip() for name, value in headers.items()}
     now = _date(named.get("date")) or time.time()
@@ -166,7 +171,7 @@ def _reset_s(named: Mapping[str, str], now: float) -> float | None:
 
 
 def _seconds(value: Any, now: float) -> float | None:
-    """Return the seconds from a number, an amount with units ("1m30s") or a date; None for what is none of these."""
+    """Return the seconds from a number, an amount with units ("1m30s") or a date; None for anything else."""
     text = str(value).strip() if isinstance(value, str | int | float) else ""
     try:
         number = float(text)

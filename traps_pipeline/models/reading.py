@@ -1,7 +1,7 @@
-"""What an answer in the ledger amounts to: an answer, or a text that is none (docs/models.md, "Broken is not modest").
+"""Interpret a ledger row: an answer, or a text that is none (docs/models.md, "Broken is not modest").
 
-The ledger keeps what a provider sent; this reading of it makes the responses table, so that a better reading asks
-nothing again. A text that is no answer is an outcome of its own and reaches no judge, who would take it for modesty.
+The ledger keeps what a provider sent; the responses table comes from this interpretation, so that improving it asks
+nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for modesty.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from traps_pipeline.models.thinking import (
 )
 from traps_pipeline.protocol.regimes import fields_of
 
-READING = "4"  # version of this module's rules; the answers' tables are stale when it is raised
-# A final answer that is announced as such and ends before the text does: one that is cut off may be another.
+READING = "4"  # version of this module's rules; raising it makes the answers' tables stale
+# An announced final answer that ends before the text does: one at the cut may be incomplete.
 _STATED = re.compile(
     r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*answer[\W_]*?(?:\bis\b\s*:?|[:=])[\s*_\"'`]*"
     r"\w[^\n]*?(?:\n|[.!?][\"'`)*_\]]*(?:\s|(?<!\d.)$))",
@@ -41,9 +41,12 @@ _SHOWN = 60  # characters of a finish reason in a sentence
 
 @dataclass(frozen=True)
 class Reading:
-    """outcome: as the ledger has it, or `degenerate`; text: what a judge is shown, None where it is shown nothing;
-    reasoning: the trace; is_json: where the prompt asks for an object, whether the text is that;
-    why: what is wrong with a text that is no answer."""
+    """An interpreted row.
+
+    outcome: as in the ledger, or `degenerate`; text: for judges, None if they are shown nothing; reasoning: the trace;
+    is_json: whether the text is the requested object, if one was requested; why: what is wrong with a text that is no
+    answer.
+    """
 
     outcome: str
     text: str | None
@@ -55,14 +58,14 @@ class Reading:
 def read_answer(
     row: Mapping[str, Any], reasoning: str | None, regime: str, *, thinking: Marks | None = None, dataset: str = ""
 ) -> Reading:
-    """Return the reading of an answer's row in the ledger.
+    """Return the interpretation of an answer's ledger row.
 
-    thinking: the marks that the model's entry declares, between which thinking stands in the visible text and is split
-    off. dataset: of the item; it may ask for another object than the regime.
+    thinking: the marks, declared by the model's entry, around thinking in the visible text, which is split off.
+    dataset: of the item; it may ask for another object than the regime.
     """
     fields = fields_of(regime, dataset)
     outcome, text = str(row["outcome"]), row["text"]
-    if outcome == UNFINISHED:  # the reason may be one that this version knows
+    if outcome == UNFINISHED:  # this version may know the reason
         finish = row.get("finish_reason")
         outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
         if outcome == UNFINISHED:
@@ -92,15 +95,18 @@ def read_answer(
 
 
 def _states_its_answer(text: str) -> bool:
-    """Return whether a text that is cut off holds a final answer: the whole field of its object, or one announced
-    before the object. What an object gives as its reason announces nothing."""
+    """Return whether a truncated text contains a final answer.
+
+    That is the complete field of its object, or an answer announced before the object. The object's reason announces
+    nothing.
+    """
     brace = _OBJECT.search(text)
     start = brace.start() if brace else len(text)
     return bool(_STATED.search(text[:start])) or "final_answer" in _whole_fields(text[start:])
 
 
 def _whole_fields(text: str) -> dict[str, Any]:
-    """Return the fields of an object that may break off, up to the first that is not whole."""
+    """Return the fields of a possibly truncated object, up to the first incomplete one."""
     fields, place = dict[str, Any](), 1
     try:
         while True:
@@ -108,7 +114,7 @@ def _whole_fields(text: str) -> dict[str, Any]:
             name, place = _DECODER.raw_decode(text, place)
             place = _skip(text, place, ":")
             value, place = _DECODER.raw_decode(text, place)
-            if not isinstance(value, str) and text[_skip(text, place)] not in ",}":  # a number may go on
+            if not isinstance(value, str) and text[_skip(text, place)] not in ",}":  # a number may continue
                 return fields
             fields[str(name)] = value
             place = _skip(text, place, ",")
@@ -117,7 +123,7 @@ def _whole_fields(text: str) -> dict[str, Any]:
 
 
 def _skip(text: str, place: int, sign: str = "") -> int:
-    """Return the place after white space, and after a sign and the white space behind it. Raises ValueError."""
+    """Return the place after white space, and after a sign and the white space after it. Raises ValueError."""
     place = len(text) - len(text[place:].lstrip())
     if not text.startswith(sign, place):
         raise ValueError(f"{sign!r} is not there")
@@ -125,10 +131,10 @@ def _skip(text: str, place: int, sign: str = "") -> int:
 
 
 def degenerate(text: str) -> str | None:
-    """Return why a text says nothing: it holds no letter and no digit, or repeats itself; None if it says something.
+    """Return why a text says nothing: it has no letter and no digit, or repeats itself; None if it says something.
 
-    A text repeats itself where a unit of at most 40 words stands at least six times in a row at its end and makes up
-    at least half of its words, or where 30 characters or more are of at most two kinds.
+    A text repeats itself if a unit of at most 40 words occurs at least six times in a row at its end and makes up at
+    least half of its words, or if 30 characters or more are of at most two kinds.
     """
     words = _WORD.findall(text.lower())
     if not words:
@@ -148,8 +154,10 @@ def degenerate(text: str) -> str | None:
 
 
 def _is_json(text: str, fields: Sequence[str]) -> bool:
-    """Return whether a text is an object with the fields that decide, `final_answer` and `abstain` if asked for, in a
-    fence or not. What reasons it gives is left to it."""
+    """Return whether a text is an object with the deciding fields, in a fence or not.
+
+    These are `final_answer`, and `abstain` if requested. The reason may have any form.
+    """
     try:
         parsed = json.loads(strip_fence(text))
     except (ValueError, RecursionError):

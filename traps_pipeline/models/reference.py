@@ -1,6 +1,6 @@
-"""Reference models: strategies that need no key and go the whole way of a paid model (docs/spec.md 5.3).
+"""Reference models: keyless strategies that take the same path as a paid model (docs/spec.md 5.3).
 
-They alone see a request's `secret` (side, ground truth, labels). What looks random is a digest of the request, so a
+Only they see a request's `secret` (side, ground truth, labels). Their random choices are digests of the request, so a
 crash and a second run give the same answers.
 """
 
@@ -15,15 +15,15 @@ from statistics import NormalDist
 from typing import Any
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.models.first_token import stored
+from traps_pipeline.models.first_token import stored_alternatives
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.protocol.regimes import fields_of
 
 ABSTENTION = "I don't know"
-_DOUBT = 0.01  # what `bayes` with noise adds to each probability, so that it can be wrong where one is 1
+_DOUBT = 0.01  # added to each probability by `bayes` with noise, so that it can be wrong if one is 1
 _TINY = 1e-12
-Strategy = Callable[[Request], str | None]  # the label answered, None for an abstention
+Strategy = Callable[[Request], str | None]  # returns a label, or None for an abstention
 
 
 def uniform(request: Request, purpose: str) -> float:
@@ -32,7 +32,7 @@ def uniform(request: Request, purpose: str) -> float:
 
 
 def _truth(request: Request) -> str:
-    """Return the right answer on a control; on a void, where there is none, a guess."""
+    """Return the right answer on a control; on a void, which has none, a guess."""
     secret = request.secret
     if secret["side"] == "control":
         return secret["ground_truth"]
@@ -41,7 +41,7 @@ def _truth(request: Request) -> str:
 
 
 def _sometimes(parameter: str) -> Strategy:
-    """Abstain with one probability on either side."""
+    """Return a strategy that abstains with a fixed probability on each side."""
 
     def strategy(request: Request) -> str | None:
         return None if uniform(request, "abstain") < request.params[parameter] else _truth(request)
@@ -49,9 +49,12 @@ def _sometimes(parameter: str) -> Strategy:
     return strategy
 
 
-def believed(request: Request) -> dict[str, float]:
-    """Return how probable `bayes` takes each answer to be: as the futures of a graded cut say, else as the oracle knows
-    (nothing of a void). noise: the standard deviation of what is wrong with the logarithms of its probabilities."""
+def believed_probabilities(request: Request) -> dict[str, float]:
+    """Return the probability that `bayes` assigns to each answer.
+
+    It follows the futures of a graded cut, otherwise the oracle's knowledge (nothing about a void). noise: standard
+    deviation of the error of log-probabilities.
+    """
     secret, noise = request.secret, request.params["noise"]
     truth, even = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
     known = secret.get("posterior") or (truth if secret["side"] == "control" else even)
@@ -63,8 +66,8 @@ def believed(request: Request) -> dict[str, float]:
 
 
 def _bayes(request: Request) -> str | None:
-    """Return the answer that is most probably right, if it is so with the probability `answers_from`."""
-    belief = believed(request)
+    """Return the most probable answer, if its probability reaches `answers_from`."""
+    belief = believed_probabilities(request)
     best = max(belief, key=lambda label: belief[label])
     return best if belief[best] >= request.params["answers_from"] else None
 
@@ -82,7 +85,7 @@ STRATEGIES: Mapping[str, Strategy] = {
 
 
 def phrase(answer: str | None, request: Request) -> str:
-    """Return the answer in the words of a model that is asked in this way."""
+    """Format an answer for the request's regime (plain text or JSON)."""
     if answer is None:
         reason, final = "The clip does not show what decides the outcome.", ABSTENTION
     else:
@@ -94,15 +97,18 @@ def phrase(answer: str | None, request: Request) -> str:
 
 
 def _stated(answer: str | None, request: Request) -> dict[str, Any]:
-    """Return the probabilities that go with an answer: those of `bayes`; else all for the answer, and of an abstention
-    none, which leaves all answers alike."""
+    """Return the probabilities to state with an answer.
+
+    They are those of `bayes`; for others all for the answer, and for an abstention none, which leaves all answers
+    equal.
+    """
     belief = _belief(answer, request)
     return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in belief.items()]}
 
 
 def _belief(answer: str | None, request: Request) -> dict[str, float]:
     if request.params.get("strategy") == "bayes":
-        return believed(request)
+        return believed_probabilities(request)
     return {answer: 1.0} if answer else {}
 
 
@@ -113,7 +119,7 @@ class ReferenceBackend:
         self._attempts: Counter[str] = Counter()
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt; see `Backend`."""
+        """Return the outcome of one attempt; see `Backend`."""
         await asyncio.sleep(0)
         misfortune = self._misfortune(request)
         if misfortune is not None:
@@ -126,12 +132,11 @@ class ReferenceBackend:
             finish_reason="stop",
             served_model=request.participant,
             cost_usd=0.0,
-            first_token=stored(belief, request.about.get("regime")),
+            first_token=stored_alternatives(belief, request.about.get("regime")),
         )
 
     def _misfortune(self, request: Request) -> Outcome | None:
-        """Return what the `faults` shares (empty, refused, failing, transient) make of this request; None for an
-        answer."""
+        """Return a simulated failure of this request by the `faults` shares; None for an answer."""
         faults: Mapping[str, Any] = request.params.get("faults", {})
         if not faults:
             return None

@@ -1,5 +1,7 @@
-"""`assets/models.yaml`: every model that can be evaluated, and the accounts they are asked through. Adding one is one
-entry, no code. Judges (`assets/judges.yaml`) are entries of the same form."""
+"""The registry of models and accounts (`assets/models.yaml`). To add a model, add an entry.
+
+Judges (`assets/judges.yaml`) are entries of the same form.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
 from traps_pipeline.models.schemas import answer_object
 from traps_pipeline.models.thinking import Marks, marks_of
@@ -28,9 +30,9 @@ from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import fields_of
 from traps_pipeline.storage.media import MediaSpec, profile_digest
 
-MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry
+MODELS_VARIABLE = "TRAPS_MODELS"  # environment variable: the path of another registry
 MODELS_FILE = Path(os.environ.get(MODELS_VARIABLE) or ASSETS / "models.yaml").absolute()
-# What the protocol sends (docs/spec.md 3.1): parameter to the names it goes under and its value. An entry that
+# The protocol's parameters (docs/spec.md 3.1): parameter to its providers' names and its value. An entry that
 # sends something else, or nothing, says why under `waivers`.
 Protocol = Mapping[str, tuple[tuple[str, ...], Any]]
 PROTOCOL: Protocol = {
@@ -42,15 +44,15 @@ JUDGE_PROTOCOL: Protocol = {
     "temperature": (("temperature",), 0.8),
     "max_tokens": (("max_tokens", "max_completion_tokens"), 512),
 }
-# What the protocol sets besides parameters. identifier: the name under which the provider serves the model.
+# The protocol's settings besides parameters. identifier: the provider's name of the model.
 OTHER_WAIVERS = ("media", "reasoning", "json_schema", "identifier", "retries")
-NETWORK = "api"  # the backend that asks over the network
-LOCAL = "local"  # the backend that asks a checkpoint on this machine
+NETWORK = "api"  # the backend for network models
+LOCAL = "local"  # the backend for checkpoints on this machine
 LOCAL_TIMEOUT_S = 24 * 3600.0
 
 
 class Limits(BaseModel):
-    """How a participant is asked; none of it is in the ledger key."""
+    """Limits of calls to a participant; none of them is in the ledger key."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     concurrency: int = Field(default=24, ge=1)
@@ -60,7 +62,7 @@ class Limits(BaseModel):
 
 
 class Account(BaseModel):
-    """Where calls go and what they share: the key's variable, the address, calls and tokens a minute."""
+    """The shared settings of calls: the key's variable, the address, calls and tokens per minute."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     key: Variable | None = Field(default=None, description="environment variable of the key")
@@ -83,7 +85,7 @@ class Account(BaseModel):
 
 
 class Prices(BaseModel):
-    """Dollars a million tokens on a date; completion tokens include reasoning."""
+    """Dollars per million tokens on a date; completion tokens include reasoning."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     input: float = Field(ge=0)
@@ -91,12 +93,12 @@ class Prices(BaseModel):
     as_of: datetime.date
 
     def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
-        """Return dollars for a call."""
+        """Return the cost of a call in dollars."""
         return (prompt_tokens * self.input + completion_tokens * self.output) / 1e6
 
 
 class Groups(BaseModel):
-    """Groups of the paper that tables select by."""
+    """The paper's groups of models, by which tables select."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: str
@@ -106,10 +108,10 @@ class Groups(BaseModel):
 
 
 class Entry(BaseModel):
-    """A participant that is asked: a model or a judge.
+    """An entry of a registry: a model or a judge.
 
-    params is exactly what is sent, and part of the ledger key. waivers: protocol parameter to the reason why it is not
-    sent as the protocol has it.
+    params is exactly what is sent, and part of the ledger key. waivers: protocol parameter to the reason why it differs
+    from the protocol.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
@@ -158,16 +160,16 @@ class Entry(BaseModel):
 
     @property
     def endpoint(self) -> str:
-        """What answers, in the ledger key: litellm's name, or the kind of backend where there is none."""
+        """The endpoint in the ledger key: litellm's name, or the kind of backend if there is none."""
         return self.provider_id or self.backend
 
     @property
     def max_tokens(self) -> int:
-        """Completion tokens at most; 0 if the entry sends no limit."""
+        """Maximum completion tokens; 0 if the entry sends no limit."""
         return int(self.params.get("max_tokens") or self.params.get("max_completion_tokens") or 0)
 
     def protocol(self) -> Protocol:
-        """Return what the protocol sends to such a participant: parameter to its names and its value."""
+        """Return the protocol's parameters for such a participant: parameter to its names and its value."""
         return PROTOCOL
 
     def _check_waivers(self, protocol: Protocol) -> None:
@@ -246,11 +248,11 @@ class ModelEntry(Entry):
             raise ValueError("device, mechanism, size: only backend local has them")
 
     def local_params(self) -> LocalParams:
-        """Return `params` of backend local, checked. Raises pydantic's ValidationError."""
+        """Return the validated `params` of backend local. Raises pydantic's ValidationError."""
         return LocalParams.model_validate(self.params)
 
     def inside_params(self) -> LocalParams:
-        """Return the parameters that the model is looked into with: those of `params`, or as `mechanism` has it."""
+        """Return the parameters for mechanistic analyses: those of `params`, or as `mechanism` overrides them."""
         params = self.local_params()
         return self.mechanism.inside(params) if self.mechanism else params
 
@@ -281,8 +283,8 @@ def _add(
     entries: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
 ) -> None:
     name = raw.get("id", "?") if isinstance(raw, dict) else "?"
-    short = [field for field in own.SHORT if isinstance(raw, dict) and field in raw]
-    if short:  # `own` writes those of an experiment out in full before they come here
+    short = [field for field in user_registry.SHORT if isinstance(raw, dict) and field in raw]
+    if short:  # `user_registry` completes an experiment's short entries before they come here
         raise TrapsError(
             f"{path}: {what} ({name}): {', '.join(short)}: an entry with an address of its own stands in an "
             "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
@@ -293,15 +295,15 @@ def _add(
     entries[entry.id] = entry
 
 
-def with_own(entries: dict[str, _Entry], key: own.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
-    """Return entries of a registry, followed by those that the experiment and the workspace add."""
+def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
+    """Return a registry's entries, followed by those that the experiment and the workspace add."""
     context = {"accounts": load_accounts()}
-    for path, raw in own.entries(key):
+    for path, raw in user_registry.entries(key):
         _add(entries, kind, raw, path, f"own {key.rstrip('s')}", context)
     return entries
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     """Return models by id, in file order. Raises TrapsError naming entry and field."""
@@ -309,7 +311,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     return with_own(models, "models", ModelEntry) if path == MODELS_FILE else models
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
@@ -318,18 +320,20 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     if not isinstance(accounts, dict):
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
     if path == MODELS_FILE:
-        accounts = {**accounts, **own.accounts()}
+        accounts = {**accounts, **user_registry.accounts()}
     return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
 
 
 def account_of(entry: Entry) -> Account:
-    """Return the account that a network entry is asked through."""
+    """Return the account of a network entry."""
     return load_accounts()[str(entry.account)]
 
 
 def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[str, Any]:
-    """Return what is sent under a regime, in a dataset that may vary it: the entry's parameters, the schema of the
-    object that is asked for where the entry has it, and of a checkpoint the digest of its weights (`declared_digest`).
+    """Return the parameters sent under a regime, in a dataset that may vary it.
+
+    They are the entry's parameters, the schema of the requested object if the entry uses schemas, and for a checkpoint
+    the digest of its weights (`declared_digest`).
     """
     if entry.backend == LOCAL:
         from traps_pipeline.models.local.checkpoint import declared_digest
@@ -342,16 +346,16 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 
 
 def answering_version(evaluation: Evaluation) -> str:
-    """Return the version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
+    """Return the version of everything that decides a model's answers under a regime besides the prompt."""
     entry = get_model(evaluation.model)
     parts: list[Any] = [effective_params(entry, evaluation.regime)]
     parts += [profile_digest(entry.media)] if entry.media else []
-    parts += [["thinking", *entry.thinking]] if entry.thinking else []  # decides what is read of an answer
+    parts += [["thinking", *entry.thinking]] if entry.thinking else []  # decides how an answer is read
     return digest([entry.id, entry.endpoint, *parts])[:16]
 
 
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
-    """Return environment variables of keys that are not set: who needs them."""
+    """Return the environment variables of keys that are not set, each with the entries that need it."""
     accounts = load_accounts()
     missing: dict[str, list[str]] = {}
     for entry in entries:
@@ -362,7 +366,7 @@ def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
 
 
 def get_model(model_id: str) -> ModelEntry:
-    """Return the entry of that id. Raises TrapsError with ids that are like it."""
+    """Return the entry of a model id. Raises TrapsError with similar ids."""
     models = load_models()
     if model_id not in models:
         near = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
@@ -371,13 +375,15 @@ def get_model(model_id: str) -> ModelEntry:
 
 
 def is_reference(model_id: str) -> bool:
-    """Return whether a model is one of the strategies, observers and rules that the rule judges are made for; on a
-    board of several submissions it may be named model@submission."""
+    """Return whether a model is a reference model (strategy, observer or rule), which rule judges can judge.
+
+    On a board of several submissions it may be named model@submission.
+    """
     known, name = load_models(), model_id.partition("@")[0]
     return name in known and known[name].backend in ("reference", "observer", "rule")
 
 
-@own.keeps
+@user_registry.cached_registry
 @cache
 def local_models() -> tuple[str, ...]:
     """Return models whose hidden states can be read, in file order."""

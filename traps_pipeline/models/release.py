@@ -1,7 +1,7 @@
-"""Give back money that is booked for calls which never left, with the reason: `traps study release-money`.
+"""Release money reserved for calls that were never sent, with the reason (`traps study release-money`).
 
-A call in flight when its process died, and a failed one that may be billed, count as their worst case for good. A
-person who has compared the provider's bill says so here; the ledger keeps who said it, when and why.
+A call in flight when its process died, and a failed one that may be billed, count as their worst case until released. A
+person who has checked the provider's bill releases them; the ledger records who, when and why.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def releasable(workspace: Workspace) -> dict[str, Releasable]:
-    """Return what may be released by participant. Raises TrapsError."""
+    """Return the releasable dollars by participant. Raises TrapsError."""
     with workspace.ledger.writing():
         return Money(workspace.ledger).releasable()
 
 
 def release(workspace: Workspace, participant: str, usd: float | None, why: str) -> float:
-    """Release dollars of a participant (None: all of its calls in flight); how many. Raises TrapsError where less is
-    booked for calls that may never have left."""
+    """Release dollars of a participant (None: all of its calls in flight) and return the amount.
+
+    Raises TrapsError if less is reserved for calls that may never have been sent.
+    """
     with workspace.ledger.writing():
         money = Money(workspace.ledger)
         account = account_budgets(workspace, money.spent()).get(participant)
@@ -36,7 +38,7 @@ def release(workspace: Workspace, participant: str, usd: float | None, why: str)
 
 
 def _person() -> str:
-    """Return the user's name; a container may have no name for its number."""
+    """Return the user's name, if the user id has one (in a container it may not)."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):

@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 OutcomeKind = Literal["answer", "truncated", "unfinished", "empty", "refused", "error", "malformed"]
 WITH_TEXT: tuple[OutcomeKind, ...] = ("answer", "truncated")  # docs/models.md, "Request -> Outcome"
-JUDGED: tuple[str, ...] = ("answer",)  # of the responses table, whose outcomes are those of `models.reading`
-UNFINISHED = "unfinished"  # ended for a reason that no reader knows: no answer, whatever its text says
+JUDGED: tuple[str, ...] = ("answer",)  # outcomes of `models.reading` that judges see
+UNFINISHED = "unfinished"  # unknown finish reason: no answer, whatever its text says
 RATE_LIMITED = "rate_limited"  # the kind of a 429
-UNREACHABLE = "unreachable"  # the kind of a call that never left: no byte of it reached a server
-MALFORMED = "malformed"  # the kind of an answer whose shape is out of order
-_VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
+UNREACHABLE = "unreachable"  # the kind of a call that was never sent: no byte of it reached a server
+MALFORMED = "malformed"  # the kind of a malformed answer
+_VERBATIM = 600  # texts up to this length are stored verbatim in the key's components, for `traps why`
 
 
 @dataclass(frozen=True)
 class Request:
-    """One call, complete: what decides the answer, and nothing else.
+    """One complete call: everything that decides the answer, and nothing else.
 
-    participant: model or judge. endpoint: kind of backend. params: exactly what is sent. about: which item, model,
-    regime, run (and task) it is for: repeated questions are calls of their own. secret: what only a reference model
-    sees (side, ground truth) or a rule (the commonest answer). media is the clip, media_digest what stands for it in
-    the key.
+    participant: model or judge. endpoint: kind of backend. params: exactly what is sent. about: the item, model,
+    regime, run (and task) of the call: repeated questions are calls of their own. secret: facts only for a reference
+    model (side, ground truth) or a rule (the commonest answer). media is the clip, media_digest its identity in the
+    key.
     """
 
     participant: str
@@ -47,7 +47,7 @@ class Request:
 
     @property
     def components(self) -> dict[str, Any]:
-        """What the ledger key is made of, by name. Holds no code version, concurrency, time-out or API key."""
+        """The parts of the ledger key, by name, without code version, concurrency, time-out or API key."""
         parts: dict[str, Any] = {
             "participant": self.participant,
             "endpoint": self.endpoint,
@@ -67,11 +67,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a request. A failure is a kind, never a text: no error string ever reaches a judge.
+    """The result of a request. A failure is a kind, never a text: no error string ever reaches a judge.
 
-    finish_reason: as the provider sent it. client: library and version that built the call and sent it. raw: the
-    beginning of an answer that is out of order, for a person. cost_usd: None if it is unknown. first_token: see
-    `first_token.stored`.
+    finish_reason: as the provider sent it. client: library and version that built and sent the call. raw: the beginning
+    of a malformed answer, for people. cost_usd: None if it is unknown. first_token: see `first_token.stored`.
     """
 
     kind: OutcomeKind
@@ -89,7 +88,7 @@ class Outcome:
     first_token: str | None = None
 
     def __post_init__(self) -> None:
-        """Remove keys from what a provider said: it may echo the request's headers."""
+        """Redact keys in the provider's texts, which may echo the request's headers."""
         for name in ("text", "reasoning", "finish_reason", "error", "served_model", "raw", "first_token"):
             value = getattr(self, name)
             if value:
@@ -97,10 +96,10 @@ class Outcome:
 
 
 class TransientError(Exception):
-    """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection, an answer out of order.
+    """A failure worth a retry: time-out, 408, 409, 429, 5xx, a cut connection, a malformed answer.
 
-    billed: whether the provider may charge for it; cost_usd: what it charges where an answer says so, else the worst
-    case counts; raw: see `Outcome`; why: what is wrong, or what kept a call from leaving, for a person.
+    billed: whether the provider may charge for it; cost_usd: the stated charge, if any, else the worst case counts;
+    raw: see `Outcome`; why: what went wrong, or why a call was not sent, for people.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class TransientError(Exception):
 
     @property
     def outcome(self) -> Outcome:
-        """What it is where there is no other try."""
+        """The outcome if there is no retry left."""
         return Outcome("malformed" if self.kind == MALFORMED else "error", error=self.kind, raw=self.raw)
 
 
@@ -127,5 +126,8 @@ class Backend(Protocol):
     """Answers requests of one participant."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt. Raises TransientError when another try may help; any other failure is an Outcome."""
+        """Return the outcome of one attempt.
+
+        Raises TransientError if a retry may help; any other failure is an Outcome.
+        """
         ...

@@ -6,9 +6,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 
-def structured(name: str, **properties: Any) -> dict[str, Any]:
-    """Return the `response_format` of an object with exactly these properties (JSON schema of each), all of them
-    required."""
+def structured_output(name: str, **properties: Any) -> dict[str, Any]:
+    """Return the `response_format` of an object with exactly these properties, all of them required.
+
+    properties: the JSON schema of each.
+    """
     return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": _object(**properties)}}
 
 
@@ -26,4 +28,4 @@ _TYPES: Mapping[str, Any] = {
 
 def answer_object(fields: Iterable[str]) -> dict[str, Any]:
     """Return the `response_format` of an answer with these fields (`regimes.FIELDS`)."""
-    return structured("answer", **{name: _TYPES[name] for name in fields})
+    return structured_output("answer", **{name: _TYPES[name] for name in fields})

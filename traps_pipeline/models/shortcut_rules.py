@@ -1,7 +1,7 @@
-"""Rules that abstain by one cue and understand nothing of the void: the line that a model must beat.
+"""Shortcut rules: abstain by one cue, without understanding the void; the baseline that a model must beat.
 
-A cue looks at the clip or at the question alone, never at the record. Where its cue is absent a rule says what the
-observer sees, and where that sees nothing the commonest answer of the sub-scenario: it abstains by its cue alone.
+A cue uses the clip or the question alone, never the record. Without its cue a rule gives the observer's answer, and if
+that has none the commonest answer of the sub-scenario: it abstains by its cue alone.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from traps_pipeline.models.framing import observed
-from traps_pipeline.models.observer import seen
+from traps_pipeline.models.framing import observer_frames
+from traps_pipeline.models.observer import observer_answer
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
 
-# Pixels of a board in one piece. Released voids have 7,700 and more; shade in a control never had above 300.
+# Minimum connected pixels of an occluder. Released voids have 7,700 and more; shade in a control at most 300.
 PANEL_PX = 1000
-CUT_FRAMES = 24  # the shortest control has so many, and each cut clip has fewer (docs/spec.md 2.5)
+CUT_FRAMES = 24  # frames of the shortest control; each cut clip has fewer (docs/spec.md 2.5)
 
 
 @lru_cache(maxsize=100_000)
@@ -39,7 +39,7 @@ def _cut(media_digest: str, clip: Path) -> bool:
 
 
 def names_no_choices(question: str) -> bool:
-    """Return whether a question puts nothing up for choice: it has no `or`."""
+    """Return whether a question offers no choice: it has no `or`."""
     return re.search(r"\bor\b", question) is None
 
 
@@ -49,14 +49,14 @@ CUES: Mapping[str, Cue] = {
     "length": lambda digest, clip, question: _cut(digest, clip),
     "wording": lambda digest, clip, question: names_no_choices(question),
 }
-RULES: Mapping[str, tuple[str, ...]] = {**{name: (name,) for name in CUES}, "any": tuple(CUES)}  # the cues of each
+RULES: Mapping[str, tuple[str, ...]] = {**{name: (name,) for name in CUES}, "any": tuple(CUES)}  # the cues of each rule
 
 
 class RuleBackend:
     """Plays the rule that `params.rule` names."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt; see `Backend`."""
+        """Return the outcome of one attempt; see `Backend`."""
         assert request.media is not None, "a rule is asked about clips"
         answer = await asyncio.to_thread(_answer, request, request.media)
         text = phrase(answer, request)
@@ -67,5 +67,5 @@ def _answer(request: Request, clip: Path) -> str | None:
     question = request.user
     if any(CUES[cue](request.media_digest, clip, question) for cue in RULES[str(request.params["rule"])]):
         return None
-    frames = observed(dataset_of(str(request.about["item_id"])))
-    return seen(request.media_digest, clip, question, frames) or str(request.secret["commonest_answer"])
+    frames = observer_frames(dataset_of(str(request.about["item_id"])))
+    return observer_answer(request.media_digest, clip, question, frames) or str(request.secret["commonest_answer"])

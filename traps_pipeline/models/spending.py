@@ -1,4 +1,4 @@
-"""Whose money a run spends: the budget that a study and its accounts leave, for as long as a run goes on."""
+"""The budget of a run: what a study and its accounts leave, while the run goes on."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @contextmanager
 def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
-    """Return the study's budget, less what was spent. All processes of the study spend from it at the same time. Raises
-    TrapsError."""
+    """Yield the study's remaining budget, which all its processes share. Raises TrapsError."""
     _check_names(workspace)
     caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
     if not any(entry.prices for entry in participants):
@@ -35,7 +34,7 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
 
 @contextmanager
 def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
-    """Ask these participants within the block; the value tells how many processes ask through an account now."""
+    """Use these participants within the block; yield a function that counts an account's current processes."""
     accounts = {entry.account for entry in participants if entry.account}
     if not accounts:
         yield lambda account: 1
@@ -45,7 +44,7 @@ def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Cal
 
 
 def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
-    """Return, by participant, the budget of its account where `study.yaml` names a folder for it. Raises TrapsError."""
+    """Return the shared account budgets that `study.yaml` configures, by participant. Raises TrapsError."""
     study, shared = workspace.study, dict[str, AccountBudget]()
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
@@ -62,7 +61,7 @@ def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
 
 
 def _check_names(workspace: Workspace) -> None:
-    """Raise TrapsError for a cap of a participant that the study does not have."""
+    """Raise TrapsError for a cap of a participant that is not in the study."""
     if unknown := workspace.study.account_budgets.keys() - load_accounts().keys():
         raise TrapsError(
             f"{workspace.root / 'study.yaml'}: account_budgets names {', '.join(sorted(unknown))}, no account of "

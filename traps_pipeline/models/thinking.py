@@ -1,5 +1,4 @@
-"""What stands around an answer in a visible text: thinking between marks that the entry of a model or a judge declares,
-a code fence, and tokens that a server did not take off."""
+"""Strip an answer's surroundings: thinking between declared marks, a code fence, and leftover special tokens."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-Marks = tuple[str, str]  # what opens the thinking, and what closes it
+Marks = tuple[str, str]  # the opening and the closing mark
 USUAL: tuple[Marks, ...] = (
     ("<think>", "</think>"),  # DeepSeek-R1, Qwen3, GLM and most others
     ("<thinking>", "</thinking>"),
@@ -29,8 +28,8 @@ _TURN = re.compile(r"<\|start\|>assistant|<\|(?:start|end|return)\|>")  # gpt-os
 
 
 @dataclass(frozen=True)
-class Split:
-    """A text in two. is_open: whether it ends inside its thinking."""
+class ThinkingSplit:
+    """A text split into thinking and answer. is_open: whether the text ends inside its thinking."""
 
     thinking: str
     answer: str
@@ -38,7 +37,7 @@ class Split:
 
 
 def marks_of(declared: str | Sequence[str]) -> Marks:
-    """Return the marks that an entry declares by both, or by the opening one if it is usual. Raises ValueError."""
+    """Return the marks that an entry declares: both, or only the opening one if it is common. Raises ValueError."""
     usual = dict(USUAL)
     if isinstance(declared, str) and declared in usual:
         return declared, usual[declared]
@@ -49,14 +48,14 @@ def marks_of(declared: str | Sequence[str]) -> Marks:
     return both[0], both[1]
 
 
-def split_thinking(text: str, marks: Marks | None) -> Split:
-    """Split the thinking off a text; without marks all of it is the answer.
+def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
+    """Split a text's thinking from its answer; without marks all of it is the answer.
 
     A closing mark without an opening one ends thinking that began with the text: some chat templates open it
     themselves.
     """
     if marks is None:
-        return Split("", text, is_open=False)
+        return ThinkingSplit("", text, is_open=False)
     opens, closes = (re.escape(mark) for mark in marks)
     thinking, answer, is_open = "", "", False
     for piece in re.split(rf"({opens}|{closes})", text, flags=re.IGNORECASE):
@@ -70,11 +69,11 @@ def split_thinking(text: str, marks: Marks | None) -> Split:
             thinking += piece
         else:
             answer += piece
-    return Split(_TURN.sub("", thinking).strip(), _TURN.sub("", answer).strip(), is_open)
+    return ThinkingSplit(_TURN.sub("", thinking).strip(), _TURN.sub("", answer).strip(), is_open)
 
 
 def strip_tokens(text: str) -> str:
-    """Return a text without the end-of-sequence tokens at its end and the invisible characters around it."""
+    """Return a text without trailing end-of-sequence tokens and surrounding invisible characters."""
     text = text.strip(_INVISIBLE)
     end, has_token = len(text), False
     while True:
@@ -87,7 +86,7 @@ def strip_tokens(text: str) -> str:
 
 
 def strip_fence(text: str) -> str:
-    """Return what is inside a code fence around a whole text, which some models and judges add; else the text."""
+    """Return the content of a code fence around a whole text, which some models and judges add; else the text."""
     text = text.strip().strip(_INVISIBLE).strip()
     if text[:3] not in ("```", "~~~") or not text[3:].endswith(text[:3]):
         return text
@@ -96,11 +95,11 @@ def strip_fence(text: str) -> str:
 
 
 def undeclared_mark(text: str) -> str | None:
-    """Return the opening one of the first usual marks that a text holds; None if it holds none."""
+    """Return the opening mark of the first common pair in a text; None if there is none."""
     lower = text.lower()
     return next((opens for opens, closes in USUAL if opens.lower() in lower or closes.lower() in lower), None)
 
 
 def how_to_declare(mark: str) -> str:
-    """Return the line of an entry that declares a usual mark."""
+    """Return the line of an entry that declares a common mark."""
     return f"thinking: {json.dumps(mark, ensure_ascii=False)}"

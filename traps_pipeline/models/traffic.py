@@ -1,5 +1,7 @@
-"""How fast a participant may be asked: connections that shrink on a 429, calls and tokens a minute of its account, and
-when a participant that only fails is stopped. None of it decides an answer."""
+"""Pace calls to participants: connections that shrink on a 429, an account's rate limits, and a circuit breaker.
+
+None of it affects an answer.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +16,17 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.request import Outcome
 
 SAME_REFUSALS = 20
-UNMADE_IN_A_ROW, UNMADE_S = 5, 12.0  # calls that never left, and seconds since the first of them
+UNMADE_IN_A_ROW, UNMADE_S = 5, 12.0  # calls that were never sent, and seconds since the first of them
 MALFORMED_IN_A_ROW = 3
 ERROR_WINDOW, ERROR_SHARE = 100, 0.10
-LOOK_S = 0.2  # how often a waiting call looks whether it is still wanted
-BURST_S = 2.0  # so many seconds' worth of calls and tokens may go out at once
+LOOK_S = 0.2  # how often a waiting call checks whether it is still wanted
+BURST_S = 2.0  # burst size, in seconds of the rate
 
 
 class Gate:
-    """Connections of one participant: halved on a 429 (once a second at most), one more for every round of answers."""
+    """The connection limit of one participant: halved on a 429 (once a second at most), raised after each round of
+    answers.
+    """
 
     def __init__(self, most: int) -> None:
         self.most, self.limit, self.open = most, most, 0
@@ -48,13 +52,13 @@ class Gate:
             self._wake()
 
     def slow_down(self) -> None:
-        """Note that the provider said 429."""
+        """Reduce the limit after a 429."""
         now = time.monotonic()
         if now - self._slowed_at >= 1.0:
             self.limit, self._slowed_at, self._answers = max(1, self.limit // 2), now, 0
 
     def answered(self) -> None:
-        """Note that the provider answered."""
+        """Count an answer, and raise the limit after a full round."""
         self._answers += 1
         if self.limit < self.most and self._answers >= self.limit:
             self.limit, self._answers = self.limit + 1, 0
@@ -70,9 +74,10 @@ class Gate:
 
 
 class Meter:
-    """Calls and tokens a minute of one account, whoever asks through it: two buckets that fill evenly. sharers: how
-    many processes ask through the account at this moment, each of which fills its buckets at an equal part of the
-    rate."""
+    """The rate limiter of one account, for calls and tokens per minute: two token buckets.
+
+    sharers: the number of processes that use the account at this moment; each gets an equal part of the rate.
+    """
 
     def __init__(
         self,
@@ -86,7 +91,7 @@ class Meter:
         self._at = time.monotonic()
 
     def _shared(self) -> list[float | None]:
-        """Return the rates of this process, a second."""
+        """Return this process's rates per second."""
         return [None if rate is None else rate / self._sharers() for rate in self._rates]
 
     @staticmethod
@@ -94,14 +99,16 @@ class Meter:
         return float("inf") if rate is None else max(rate * BURST_S, least)
 
     async def admit(self, tokens: int, halted: Callable[[], bool] = lambda: False) -> None:
-        """Wait until one call of so many tokens may go out, or until nothing is to be sent any more. The bucket may go
-        below zero: later calls wait longer."""
+        """Wait until one call with this number of tokens may be sent, or until calls are halted.
+
+        The bucket may go below zero: later calls wait longer.
+        """
         until = time.monotonic() + self._take((1.0, float(tokens)))
         while (remaining := until - time.monotonic()) > 0 and not halted():
             await asyncio.sleep(min(remaining, LOOK_S))
 
     def _take(self, amounts: tuple[float, float]) -> float:
-        """Take from the buckets; the seconds until they are at zero again."""
+        """Take from the buckets; return the seconds until they are at zero again."""
         now, wait = time.monotonic(), 0.0
         for k, (rate, amount) in enumerate(zip(self._shared(), amounts, strict=True)):
             if rate is None:
@@ -112,16 +119,16 @@ class Meter:
         return wait
 
 
-class Stopped(TrapsError):
-    """A participant that is asked no more; the others go on."""
+class ParticipantStopped(TrapsError):
+    """A participant that is no longer asked; the others go on."""
 
 
-_stopped: list[dict[str, str]] = []  # of each `remembering_stops` in force: participant to what was said
+_stopped: list[dict[str, str]] = []  # one per active `remembering_stops`: participant to message
 
 
 @contextmanager
 def remembering_stops() -> Iterator[None]:
-    """Keep a stopped participant stopped, within the block, for all who ask it next, for the same reason."""
+    """Keep a stopped participant stopped within the block, for all later callers, with the same reason."""
     _stopped.append({})
     try:
         yield
@@ -130,24 +137,26 @@ def remembering_stops() -> Iterator[None]:
 
 
 class Breaker:
-    """Watches what comes back from one participant."""
+    """A circuit breaker for one participant."""
 
     def __init__(self, participant: str, address: str | None = None) -> None:
         self._participant, self._address = participant, address
-        self._unmade, self._unmade_since = 0, 0.0  # calls that never left in a row, and when the first was tried
+        self._unmade, self._unmade_since = 0, 0.0  # consecutive unsent calls, and when the first was tried
         self._refusal, self._in_a_row = "", 0
-        self._malformed = 0  # in a row
+        self._malformed = 0  # consecutive
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
-        """Raise Stopped for a participant that was stopped before (`remembering_stops`)."""
+        """Raise ParticipantStopped for a participant that was stopped before (`remembering_stops`)."""
         for stopped in _stopped:
             if self._participant in stopped:
-                raise Stopped(stopped[self._participant])
+                raise ParticipantStopped(stopped[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raise Stopped after five calls in a row that never left, the first of them a while ago: a server that is
-        started again has that long. why: what kept the last one."""
+        """Raise ParticipantStopped after five consecutive unsent calls, the first of them some time ago.
+
+        A restarted server has that long. why: why the last one was not sent.
+        """
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
         if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:
@@ -155,12 +164,15 @@ class Breaker:
             self._stop(f"{self._unmade} calls in a row{where} could not be sent{why and f': {why}'}")
 
     def connected(self) -> None:
-        """Note that a call was sent."""
+        """Record that a call was sent."""
         self._unmade, self._unmade_since = 0, 0.0
 
     def watch(self, outcome: Outcome) -> None:
-        """Raise Stopped after 20 refusals of the same kind in a row, after three answers out of order in a row, or when
-        over 10 of the last 100 calls failed."""
+        """Raise ParticipantStopped after repeated failures.
+
+        These are 20 consecutive refusals of the same kind, three consecutive malformed answers, or more than 10
+        failures in the last 100 calls.
+        """
         refusal = _refusal(outcome)
         self._in_a_row = self._in_a_row + 1 if refusal and refusal == self._refusal else int(bool(refusal))
         self._refusal = refusal
@@ -183,12 +195,12 @@ class Breaker:
             "command again: only what is missing is asked"
         )
         for stopped in _stopped:
-            stopped.setdefault(self._participant, message)  # calls in flight then come back later, and raise too
-        raise Stopped(message)
+            stopped.setdefault(self._participant, message)  # calls in flight return later, and raise too
+        raise ParticipantStopped(message)
 
 
 def _refusal(outcome: Outcome) -> str:
-    """Return the kind of a refusal by the provider (of the content, or of the call as it is); empty if it is none."""
+    """Return the kind of a provider's refusal (of the content, or of the call itself); empty if it is none."""
     if outcome.kind == "refused":
         return outcome.error or outcome.finish_reason or "refused"
     return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_") else ""

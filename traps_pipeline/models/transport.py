@@ -1,5 +1,8 @@
-"""What went over the wire in one attempt. The transport (`models/wire.py`) writes it down below the client libraries,
-which turn odd answers into errors that look as if nothing had been billed."""
+"""The record of one attempt on the wire.
+
+The transport (`models/wire.py`) writes it below the client libraries, which turn malformed answers into errors that
+look unbilled.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,17 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-_GIVEN_UP = (408, 499, 504, 524)  # statuses of a call that a server took and gave up, so that its work may be billed
+_GIVEN_UP = (408, 499, 504, 524)  # the server accepted the call and abandoned it, so its work may be billed
 _NOT_TAKEN = (503, 529)
 
 
 @dataclass
 class Exchange:
-    """One attempt as the wire saw it.
+    """One attempt as seen on the wire.
 
-    sent: whether bytes of the request were handed to a connected server; None where nobody looks (a backend without a
-    network). status, headers: of the answer. content: its decoded body, None if it was not read to its end. proxy: the
-    variable that named the proxy. problem: why nothing was sent, or why no answer came.
+    sent: whether bytes of the request were handed to a connected server; None if unknown (a backend without a network).
+    status, headers: of the answer. content: its decoded body, None if it was not read to its end. proxy: the variable
+    that named the proxy. problem: why nothing was sent, or why no answer came.
     """
 
     sent: bool | None = None
@@ -30,20 +33,19 @@ class Exchange:
 
     @property
     def never_left(self) -> bool:
-        """Whether it is certain that no byte of the request reached a server."""
+        """Whether certainly no byte of the request reached a server."""
         return self.sent is False
 
     @property
     def is_answered(self) -> bool:
-        """Whether a server said that it did what it was asked to."""
+        """Whether a server reported success."""
         return self.status is not None and 200 <= self.status < 300
 
     def may_be_billed(self, status: int, *, is_explained: bool) -> bool:
         """Return whether the provider may charge for an answer with a status.
 
-        status: the one on the wire, or the one in the body, where that counts in its place. is_explained: whether an
-        error object of the provider's stands in the place of an answer; a page of a proxy on the way tells nothing of
-        what the provider did.
+        status: the one on the wire, or the one in the body that overrides it. is_explained: whether the answer is a
+        provider's error object; a page of a proxy on the way says nothing about the provider.
         """
         if self.never_left:
             return False
@@ -57,7 +59,7 @@ WATCHED: ContextVar[Exchange | None] = ContextVar("watched", default=None)
 
 @contextmanager
 def watching() -> Iterator[Exchange]:
-    """Let the wire write into this exchange within the block: the one that a caller watches already, or a new one."""
+    """Record the wire's traffic within the block, in the exchange that a caller already watches, or in a new one."""
     if (outer := WATCHED.get()) is not None:
         yield outer
         return

@@ -1,7 +1,7 @@
-"""What a call took, in a provider's own words: believed where these are whole and possible, and never otherwise.
+"""Read a call's token usage from a provider's answer, and believe it only if it is complete and possible.
 
-They are read from the answer as it came, since litellm makes zeros of what is not there. What is not believed is
-unknown, and a call whose tokens are unknown counts as its worst case (docs/models.md, "Money").
+It is read from the raw answer, since litellm replaces missing counts by zeros. An unbelievable usage is unknown, and a
+call with unknown tokens counts as its worst case (docs/models.md, "Money").
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-BYTES_A_TOKEN = 8  # of text: no provider's tokenizer puts more into a token, on average over a text
-TOKENS_A_FRAME = 8  # at least
-MOST_TOKENS = 10**9  # what is above is no count
+BYTES_A_TOKEN = 8  # bytes of text per token: the maximum of any provider's tokenizer, averaged over a text
+TOKENS_A_FRAME = 8  # minimum
+MOST_TOKENS = 10**9  # anything above is no count
 
-# By dialect: prompt tokens, those of the answer, all of them, and what of the answer (True) or of the prompt (False) is
-# counted apart from these. Anthropic gives no sum.
+# By dialect: prompt tokens, answer tokens, their sum, and parts of the answer (True) or of the prompt (False) that are
+# counted separately. Anthropic gives no sum.
 _FORMS: tuple[tuple[tuple[str, str, str], Mapping[str, bool]], ...] = (
     (("prompt_tokens", "completion_tokens", "total_tokens"), {}),
     (
@@ -38,9 +38,9 @@ _REASONING = (
 
 @dataclass(frozen=True)
 class Usage:
-    """Tokens of a call; completion holds the reasoning, which may be unknown.
+    """Tokens of a call; completion includes the reasoning, which may be unknown.
 
-    believed: whether the fields are whole and possible; otherwise these are the most that any of them says.
+    believed: whether the counts are complete and possible; if not, they are the highest of any field.
     """
 
     prompt: int
@@ -51,22 +51,22 @@ class Usage:
 
 @dataclass(frozen=True)
 class Sizes:
-    """What we know of a call without the provider: bytes of its prompt's text, frames, bytes of the text it gave."""
+    """Our own measure of a call: bytes of its prompt's text, frames, bytes of the returned text."""
 
     prompt_bytes: int
     frames: int
     text_bytes: int
 
     def contradict(self, usage: Usage) -> bool:
-        """Return whether a usage is below what this takes at the very least: no answer took nothing."""
+        """Return whether a usage is below the minimum for these sizes; an answer cannot take 0 tokens."""
         least = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
         return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
 
 
 def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
-    """Return the usage in an answer's counts; None where they hold none.
+    """Return the usage in an answer's counts; None if they contain none.
 
-    It is not believed where it is not whole, not possible, or below what prompt and text take by our own count.
+    It is not believed if it is incomplete, impossible, or below our own count for prompt and text.
     """
     for (prompt, completion, total), apart in _FORMS:
         if prompt in fields:
@@ -76,7 +76,7 @@ def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
 
 
 def _at_least(fields: Mapping[str, Any]) -> Usage | None:
-    """Return the most that the counts of a usage say which cannot be believed as a whole."""
+    """Return the highest counts of a usage that is not believable as a whole."""
     counts = {name: value for name, value in fields.items() if _is_count(value)}
     prompt = sum(counts.get(name, 0) for name in _OF_PROMPT)
     completion = sum(counts.get(name, 0) for name in _OF_ANSWER)
@@ -89,7 +89,7 @@ def _whole(
 ) -> Usage | None:
     counts = {name: fields[name] for name in (prompt, completion, total, *apart) if name and name in fields}
     if prompt == "promptTokenCount":
-        counts.setdefault(completion, 0)  # Gemini leaves it out where all was thought; its sum is always there
+        counts.setdefault(completion, 0)  # Gemini omits it if everything was thinking; its sum is always present
         if total not in counts:
             return None
     if prompt == "input_tokens":
@@ -103,9 +103,7 @@ def _whole(
     if total in counts:
         if counts[total] < counts[prompt] + counts[completion]:
             return None
-        completion_tokens = max(
-            completion_tokens, counts[total] - read_tokens
-        )  # some tell their reasoning in the sum alone
+        completion_tokens = max(completion_tokens, counts[total] - read_tokens)  # some count reasoning only in the sum
     return Usage(read_tokens, completion_tokens, _reasoning(fields, completion_tokens))
 
 

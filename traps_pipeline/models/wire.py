@@ -1,9 +1,8 @@
-"""The one way in which calls leave this machine: a transport for httpx on aiohttp, which says where bytes are written.
+"""The only way out of this machine for calls: an httpx transport on aiohttp that records what was sent.
 
-`use_in` makes litellm's clients take it, whichever route they serve. An attempt finds in its `Exchange` whether its
-request was sent, with what status it was answered, and the answer's bytes. Loopback addresses are asked directly, a
-redirect is never followed, an attempt sends one request at most, an answer is read up to a bound, and nothing
-compressed is asked for.
+`use_in` makes litellm's clients use it on every route. Each attempt's `Exchange` records whether its request was sent,
+the status of the answer, and the answer's bytes. Loopback addresses bypass proxies, redirects are not followed, an
+attempt sends one request at most, an answer is read up to a bound, and no compression is requested.
 """
 
 from __future__ import annotations
@@ -25,22 +24,25 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, proxy_of
 from traps_pipeline.models.transport import Exchange, watching
 
-MOST_BYTES = 16 * 2**20  # of an answer; 8,000 tokens with their reasoning take less than a hundredth of it
-CONNECT_S = 60.0  # for a connection with its TLS handshake
+MOST_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
+CONNECT_S = 60.0  # time-out of a connection with its TLS handshake
 KEEPALIVE_S, NAMES_KEPT_S = 120.0, 300  # an idle connection; an address of a name
 _ASKED_ANEW = ("content-encoding", "content-length", "transfer-encoding", "location")
 
 
 class _Body(aiohttp.BytesPayload):
-    """A request's body. aiohttp keeps the headers back until it is written, on a connection whose handshakes (of a
-    proxy's tunnel, of TLS) are done: so the first byte of a request is written here and nowhere else."""
+    """A request's body, which records when its first byte is written.
+
+    aiohttp holds the headers back until the body is written, on a connection whose handshakes (of a proxy's tunnel, of
+    TLS) are done: so the first byte of a request is written here and nowhere else.
+    """
 
     def __init__(self, content: bytes, exchange: Exchange) -> None:
         super().__init__(content, content_type="application/json")
         self._exchange = exchange
 
     async def write_with_length(self, writer: AbstractStreamWriter, content_length: int | None) -> None:
-        """Write the headers and the body, and note that bytes are handed over unless the connection is closed."""
+        """Write headers and body, and record that bytes are sent unless the connection is closed."""
         transport = getattr(writer, "transport", None)
         if transport is None or transport.is_closing():
             raise aiohttp.ClientConnectionResetError("the connection was closed before the request was written")
@@ -49,17 +51,22 @@ class _Body(aiohttp.BytesPayload):
 
 
 class Wire(httpx.AsyncBaseTransport):
-    """Sends requests with aiohttp, a session for each event loop. tls: a context, or False to trust every certificate;
-    None: the certificates that SSL_CERT_FILE or certifi names."""
+    """Sends requests with aiohttp, with one session per event loop.
+
+    tls: a context, or False to trust every certificate; None: the certificates that SSL_CERT_FILE or certifi names.
+    """
 
     def __init__(self, tls: ssl.SSLContext | bool | None = None) -> None:
         self._tls = tls
-        self._certificates: list[str | None] = []  # what the environment named when that was looked at
+        self._certificates: list[str | None] = []  # the environment's settings when the session was created
         self._sessions: dict[asyncio.AbstractEventLoop, aiohttp.ClientSession] = {}
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
-        """Send a request and read the answer to its end. Raises httpx.ReadTimeout, and NetworkError for anything else:
-        neither makes a client library try again. `Exchange.problem` says what happened."""
+        """Send a request and read the answer to its end.
+
+        Raises httpx.ReadTimeout, and NetworkError for anything else: neither makes a client library retry.
+        `Exchange.problem` says what happened.
+        """
         with watching() as exchange:
             if exchange.sent:
                 raise httpx.NetworkError("a client library wanted to send a second request in one attempt")
@@ -116,7 +123,7 @@ class Wire(httpx.AsyncBaseTransport):
         return self._sessions[loop]
 
     async def aclose(self) -> None:
-        """Close the connections of the running loop, and of loops that are closed."""
+        """Close the connections of the running loop, and of closed loops."""
         running = self._sessions.pop(asyncio.get_running_loop(), None)
         if running is not None:
             await running.close()
@@ -130,7 +137,7 @@ class Wire(httpx.AsyncBaseTransport):
 
 
 def _dispose(session: aiohttp.ClientSession) -> None:
-    """Close a session whose loop is closed: nothing is waited for then, and aiohttp complains of no open session."""
+    """Close a session whose loop is closed, without waiting; otherwise aiohttp would report an open session."""
     with suppress(StopIteration):
         session.close().send(None)
 
@@ -147,7 +154,7 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
 
 
 def _decoded(content: bytes, encoding: str) -> bytes:
-    """Return a body unpacked. Raises ValueError for one that breaks off, is too large, or is in another encoding."""
+    """Return a decompressed body. Raises ValueError if it is truncated, too large, or in another encoding."""
     if encoding.lower() == "identity":
         return content
     if encoding.lower() not in ("gzip", "x-gzip", "deflate"):
@@ -165,7 +172,7 @@ def _decoded(content: bytes, encoding: str) -> bytes:
 
 
 def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
-    """Return in words what kept a request or its answer from arriving."""
+    """Return in words why a request or its answer did not arrive."""
     if isinstance(error, TrapsError):
         return str(error)
     where = f"{url.host}:{url.port or {'http': 80, 'https': 443}.get(url.scheme, '?')}"
@@ -179,7 +186,7 @@ def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
 
 
 def cause_of(error: BaseException) -> str:
-    """Return the words of the error at the root of another one, with what to do about the usual ones."""
+    """Return the message of an error's root cause, with advice about common ones."""
     while (deeper := error.__cause__ or (None if error.__suppress_context__ else error.__context__)) is not None:
         error = deeper
     if isinstance(error, ssl.SSLCertVerificationError):
@@ -197,8 +204,11 @@ def cause_of(error: BaseException) -> str:
 
 
 def use_in(handler: Any) -> None:
-    """Make every client that litellm creates from now on send through a `Wire`. handler: its class AsyncHTTPHandler,
-    which both its own client and the one that it hands to OpenAI's library get their transport from."""
+    """Make every client that litellm creates from now on send through a `Wire`.
+
+    handler: its class AsyncHTTPHandler, from which both its own client and the one for OpenAI's library get their
+    transport.
+    """
 
     def create(ssl_context: ssl.SSLContext | None = None, ssl_verify: bool | None = None, **_: Any) -> Wire:
         return Wire(ssl_context if ssl_context is not None else False if ssl_verify is False else None)
@@ -207,8 +217,10 @@ def use_in(handler: Any) -> None:
 
 
 def get(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Response:
-    """Return the answer to a GET without a body, for callers outside of an event loop. Raises TrapsError that says
-    why there is none."""
+    """Return the answer to a GET without a body, for callers outside of an event loop.
+
+    Raises TrapsError that says why there is none.
+    """
 
     async def answer() -> httpx.Response:
         async with httpx.AsyncClient(transport=Wire(), timeout=timeout_s, follow_redirects=False) as client:

@@ -1,1 +1,1 @@
-"""People: samples to label, their labels, the human row, scores corrected by them, judges validated against them."""
+"""People's labels: samples to label, people's scores, scores corrected by labels, and validation of judges."""

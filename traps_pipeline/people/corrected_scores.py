@@ -1,9 +1,9 @@
-"""Scores corrected for the panel's errors, where people labelled answers that the panel judged (docs/people.md).
+"""Correct scores for the panel's errors, which people's labels of judged answers reveal (docs/people.md).
 
-A panel that says yes to a share Se of what people call yes, and no to a share Sp of what they call no, says yes to
-p = Se t + (1 - Sp) (1 - t) of answers of which t are yes. Solved for t (Rogan and Gladen 1978), this turns a judged
-share into a corrected one. Se, Sp and the shares are drawn together: a scenario that is resampled takes its labelled
-answers along, so that the intervals hold the uncertainty of both.
+A panel with sensitivity Se and specificity Sp against people says yes to p = Se t + (1 - Sp) (1 - t) of answers of
+which a share t is yes. Solved for t (Rogan and Gladen 1978), this turns a judged share into a corrected one. Se, Sp and
+the shares are resampled together: a resampled scenario takes its labelled answers along, so that the intervals hold the
+uncertainty of both.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from traps_pipeline.scoring.bootstrap import (
 )
 from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
 
-SHARES: tuple[TaskName, ...] = ("correctness", "abstention", "abstention")  # behind Acc, FalseAbs and AbsRec
+SHARES: tuple[TaskName, ...] = ("correctness", "abstention", "abstention")  # the tasks behind Acc, FalseAbs and AbsRec
 NO_BETTER = "the panel agrees with people no better than chance"
 Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and specificity, (2, 2, draws)
 
@@ -43,7 +43,7 @@ Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and s
 def panel_errors(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows; none where nothing was labelled."""
+    """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows; none without labels."""
     rows = []
     if _is_labelled(labels):
         resampling = _drawn(verdicts, resamples, seed)
@@ -57,8 +57,11 @@ def panel_errors(
 def corrected(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return CORRECTED rows from the same: every model under every regime, judged and corrected in the same resamples
-    as the leaderboard's. There are none unless people labelled answers for both tasks, since PECS needs both."""
+    """Return CORRECTED rows: every model under every regime, as judged and as corrected.
+
+    Both come from the same resamples as the leaderboard's. There are none unless people labelled answers for both
+    tasks, since PECS needs both.
+    """
     nothing = pd.DataFrame(columns=pd.Index(CORRECTED.names))
     if not _is_labelled(labels):
         return nothing
@@ -79,16 +82,21 @@ def corrected(
 
 
 def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.ndarray) -> np.ndarray:
-    """Return the true share behind a judged one, elementwise, within [0, 1]; NaN where the two errors leave nothing to
-    tell yes from no by (sensitivity + specificity is 1 or less)."""
+    """Return the true share behind a judged one, elementwise, within [0, 1].
+
+    NaN if sensitivity + specificity is 1 or less: then the judged share carries no information.
+    """
     gain = sensitivity + specificity - 1
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.clip(np.where(gain > 1e-12, (share + specificity - 1) / gain, np.nan), 0.0, 1.0)
 
 
 def _corrected_ends(share: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return the ends of a corrected share, (2, draws), from those of the judged one, (2, draws), and of sensitivity
-    and specificity, (2, 2, draws): it rises with the share and with specificity, and falls with sensitivity."""
+    """Return the ends of a corrected share, (2, draws).
+
+    They come from the ends of the judged share, (2, draws), and of sensitivity and specificity, (2, 2, draws): the
+    corrected share rises with the judged share and with specificity, and falls with sensitivity.
+    """
     sensitivity, specificity = errors[:, 0], errors[:, 1]
     return rogan_gladen(share, sensitivity[::-1], specificity)
 
@@ -103,7 +111,7 @@ def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Resampling:
 
 
 def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
-    """Return the panel's sensitivity and specificity by labelled task and draw; NaN without people's yes, or no."""
+    """Return the panel's sensitivity and specificity by labelled task and draw; NaN if people never say yes, or no."""
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
         answers = truths(labels, task).dropna(subset=["truth"])
@@ -161,7 +169,7 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
 
 
 def _runs(group: pd.DataFrame, dataset: str) -> int:
-    """Return how many runs of a model and regime are behind its row of a dataset, or `overall`: those with all four."""
+    """Return the number of runs behind the row of a dataset; for `overall` those with all four datasets."""
     if dataset != "overall":
         return len(set(group["run"][group["dataset"] == dataset]))
     return sum(len(set(rows["dataset"])) == len(DATASETS) for _, rows in group.groupby("run"))

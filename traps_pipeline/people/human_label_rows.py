@@ -1,4 +1,4 @@
-"""The tables of people's labels and of their agreement, and the files that they are made from."""
+"""The tables of people's labels and of their agreement, and the version of the underlying files."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,7 +11,7 @@ from traps_pipeline.protocol.regimes import REGIMES, one_of
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
-LABELS_FILE = "labels.jsonl"  # in a study's folder of labels
+LABELS_FILE = "labels.jsonl"  # file in a study's folder of labels
 PROTOCOL_FILE = ASSETS / "annotation.yaml"
 PeopleTask = Annotated[str, "answerability, confabulation, abstention or correctness"]
 Axis = Annotated[bool | None, "an axis of confabulation; null in other tasks"]
@@ -69,6 +69,6 @@ HUMAN_AGREEMENT = Table("human_agreement", HumanAgreementRow, partition_by=(), k
 
 
 def labels_version(folder: Path) -> str:
-    """Return a digest of the labels in a study's folder of labels."""
+    """Return the digest of the labels in a study's folder of labels."""
     path = folder / LABELS_FILE
     return file_digest(path)[:16] if path.is_file() else "not run"

@@ -1,4 +1,4 @@
-"""The tables of figures that people's labels give: the human row, the panel's errors, judge-corrected scores."""
+"""The tables of figures from people's labels: the human row, the panel's errors, judge-corrected scores."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,7 @@
-"""The human row: what people score on the clips that models are asked (docs/people.md).
+"""The human row: people's scores on the clips that models are asked about (docs/people.md).
 
-Labels of all people are pooled. A label weighs as many units as it stands for (those of its stratum by the labels of
-it), so that clips which were chosen because the judges are split about them count no more than they do in the study.
+Labels of all people are pooled. A label is weighted by the size of its stratum over the number of its labels, so that
+clips chosen because the judges are split about them count no more than they do in the study.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_versi
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
-    """Return how many units of the study each label stands for, (labels,): its stratum's size by its labels."""
+    """Return the weight of each label, (labels,): its stratum's size over the number of its labels."""
     return (labels["stratum_size"] / labels.groupby("stratum")["stratum"].transform("size")).to_numpy(float)
 
 
@@ -71,6 +71,6 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
-    """Return each figure with its interval, as columns, from draws (2, names, 1 + resamples), the observed first."""
+    """Return each figure with its interval, as columns, from draws (2, names, 1 + resamples), observed ones first."""
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
     return {name: value for of_figure in columns for name, value in of_figure.items()}

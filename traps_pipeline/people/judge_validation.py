@@ -1,7 +1,7 @@
-"""The confabulation judge against two blind annotators (docs/spec.md 6.3).
+"""Validate the confabulation judge against two blind annotators (docs/spec.md 6.3).
 
-`annotation_sheet` writes what the annotators are shown: question, void kind, answer, and the trace where the judge saw
-it; a sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
+`annotation_sheet` writes the annotators' material: question, void kind, answer, and the trace if the judge saw it; a
+sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.agreement import cohen_kappa
-from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, drawn, load_protocol, sample_id
+from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, draw_sample, load_protocol, sample_id
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -39,7 +39,7 @@ _SHOWN = 5
 
 @dataclass(frozen=True)
 class HumanLabels:
-    """Two annotators' labels. annotators: in alphabetical order. sample_ids: failures. labels: (2, failures, axes)."""
+    """Two annotators' labels. annotators: sorted by name. sample_ids: failures. labels: (2, failures, axes)."""
 
     annotators: tuple[str, str]
     sample_ids: tuple[str, ...]
@@ -50,20 +50,22 @@ class HumanLabels:
 
 
 def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
-    """Return what an annotator is shown of each failure: sample_id, question, why_unanswerable, reasoning_trace (empty
-    without one) and response, in an order that reveals nothing. Raises TrapsError if no failure of the models to
-    validate was labelled, or if a failure's answer has been replaced."""
+    """Return an annotator's material for each failure, in an order that reveals nothing.
+
+    Columns sample_id, question, why_unanswerable, reasoning_trace (empty without one) and response. Raises TrapsError
+    if no failure of the models to validate was labelled, or if a failure's answer has been replaced.
+    """
     protocol = load_protocol()
     labels = _judged(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
     if labels.empty:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
-    chosen = drawn(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
+    chosen = draw_sample(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
     return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
-    """Return the rows that an annotator fills in: SHEET_COLUMNS by failure, of `sheet_rows`, safe for a spreadsheet."""
+    """Return the rows that an annotator fills in: SHEET_COLUMNS of `sheet_rows`, safe for a spreadsheet."""
     empty = dict.fromkeys(LABEL_COLUMNS, "")
     return [
         empty | {name: str(no_formula(text)) for name, text in row.items()} | {"sample_id": row["sample_id"]}
@@ -98,7 +100,7 @@ def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
 
 
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
-    """Write a sheet, or LABEL_COLUMNS alone, as CSV. Raises TrapsError if the file exists, since it may hold labels."""
+    """Write a sheet, or only LABEL_COLUMNS, as CSV. Raises TrapsError if the file exists, since it may hold labels."""
     if path.exists():
         raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -192,7 +194,7 @@ def _judged(workspace: Workspace) -> pd.DataFrame:
 
 
 def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
-    """Return JUDGE_VALIDATION rows of the judge's labels, (failures, axes) of bool, against both annotators'.
+    """Return JUDGE_VALIDATION rows that compare the judge's labels, (failures, axes) of bool, with both annotators'.
 
     Pooled labels are both annotators' labels side by side, without a consensus: 2 x failures per axis.
     """
@@ -213,7 +215,7 @@ def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
 
 
 def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
-    """judge: (failures,); labels: (2, failures)."""
+    """Return the row of an axis. judge: (failures,); labels: (2, failures)."""
     one, other = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
@@ -236,15 +238,15 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
 
 
 def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether one class has at most 2 % of either annotator's labels: kappa then says nothing."""
+    """Return whether one class has at most 2 % of either annotator's labels, so that kappa is meaningless."""
     return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
 
 
 def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
-    """Return Cohen's kappa and its 95 % interval, a Bayesian bootstrap over failures; NaN where degenerate.
+    """Return Cohen's kappa and its 95 % interval, a Bayesian bootstrap over failures; NaN if degenerate.
 
     One failure is unseen: at the lower end the annotators differ on it, at the upper end they agree. So the interval
-    keeps a width where they always agree.
+    keeps a width even if they always agree.
     """
     if is_degenerate(one, other):
         return np.nan, np.nan, np.nan
@@ -266,7 +268,7 @@ def _share(part: int, total: int) -> float:
 
 
 def validation_text(rows: pd.DataFrame) -> str:
-    """Return JUDGE_VALIDATION rows as a person reads them."""
+    """Return JUDGE_VALIDATION rows as text for people."""
     first = rows.iloc[0]
     title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures"
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
@@ -279,7 +281,7 @@ def validation_text(rows: pd.DataFrame) -> str:
 
 
 def _kappa_cells(row: Mapping[Any, Any]) -> tuple[str, str]:
-    """Return kappa, or why there is none, and its interval."""
+    """Return kappa, or the reason for its absence, and its interval."""
     if pd.notna(row["kappa_note"]):
         return row["kappa_note"], ""
     if np.isnan(row["human_kappa"]):

@@ -1,9 +1,9 @@
-"""What people label: the clips and answers of each task, and the seeded sample of them (docs/people.md).
+"""Units for people to label: the clips and answers of each task, and a seeded sample of them (docs/people.md).
 
-Everything that could be labelled in a task is a unit. Its id is a digest of what is shown, so that people's labels of
-one clip or answer are never taken for labels of another. Units of a task are in groups, and each group in two strata:
-those that split the judges, and the others. The units with the smallest digests of a stratum are sampled, so that
-labels of a stratum are a random sample of it, and figures can give each stratum the weight that it has in the study.
+Everything that a task could label is a unit. Its id is a digest of the shown content, so that people's labels of one
+clip or answer are never taken for labels of another. A task's units are in groups, and each group in two strata: those
+that split the judges, and the others. The units with the smallest digests of a stratum are sampled, so that labels of a
+stratum are a random sample of it, and figures can weight each stratum by its share in the study.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 TaskName = Literal["answerability", "confabulation", "abstention", "correctness"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)
-ABOUT_ANSWERS: tuple[TaskName, ...] = ("abstention", "correctness")  # in which people decide what the panel decides
+ABOUT_ANSWERS: tuple[TaskName, ...] = ("abstention", "correctness")  # tasks in which people make the panel's decisions
 UNIT_COLUMNS = (
     *("unit", "item_id", "dataset", "scenario_id", "side", "model", "regime", "run"),
     *("group", "split", "panel", "benchmark_version"),
@@ -41,7 +41,7 @@ _UNIT_DIGITS = 16
 
 
 class Sizes(BaseModel):
-    """How many units of each group of a task are sampled."""
+    """The sample sizes of each group of a task."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     answerability: int = Field(ge=1)
@@ -50,7 +50,7 @@ class Sizes(BaseModel):
 
 
 class AnnotationProtocol(BaseModel):
-    """`assets/annotation.yaml`."""
+    """The contents of `assets/annotation.yaml`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     seed: int
@@ -62,13 +62,15 @@ class AnnotationProtocol(BaseModel):
 
 @cache
 def annotation_protocol(path: Path = PROTOCOL_FILE) -> AnnotationProtocol:
-    """Return the protocol. Raises TrapsError naming the field that is wrong."""
+    """Return the protocol. Raises TrapsError naming the wrong field."""
     return parse_yaml_model(AnnotationProtocol, read_yaml(path), path)
 
 
 def units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """Return UNIT_COLUMNS of everything in the study that the task could label: panel is what the panel decided (null
-    but in ABOUT_ANSWERS), model, regime and run are null for clips. A study without such things gives no rows."""
+    """Return UNIT_COLUMNS of all units of a task in the study; no rows if there are none.
+
+    panel is the panel's decision (null except in ABOUT_ANSWERS); model, regime and run are null for clips.
+    """
     if task == "answerability":
         clips = _clips(workspace)
     elif task == "confabulation":
@@ -119,7 +121,7 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 
 
 def _failures(workspace: Workspace) -> pd.DataFrame:
-    """Return the failures that the judge of confabulation labelled; `validation` samples them."""
+    """Return the failures that the confabulation judge labelled; `validation` samples them."""
     rows = workspace.tables.read_all(CONFABULATION)
     judged = rows.loc[rows["valid"].astype(bool) & rows["model"].isin(load_protocol().validation.models)]
     scenarios = judged["item_id"].str.split(":").str[1]
@@ -131,7 +133,7 @@ def _unit(*shown: str) -> str:
 
 
 def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """Return the units that people are given, as `units` has them: `drawn` of each group, or the sheet's failures."""
+    """Return the sampled units for people, in the columns of `units`: `draw_sample`, or the sheet's failures."""
     population = units(workspace, task)
     if population.empty:
         return population
@@ -145,8 +147,11 @@ def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 
 
 def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) -> pd.DataFrame:
-    """Return a seeded sample of a group without replacement: a share from all units, then the rest from those that
-    split the judges and, where these are too few, from all again. All units where there are no more than `size`."""
+    """Return a seeded sample of a group without replacement: all units if there are at most `size`.
+
+    A share comes from all units, then the rest from those that split the judges and, if these are too few, from all
+    again.
+    """
     order = [digest([protocol.seed, unit]) for unit in group["unit"]]
     ordered = group.iloc[np.argsort(order)]
     at_random = ordered.head(size - round(size * protocol.split_share))
@@ -164,7 +169,7 @@ def strata(population: pd.DataFrame) -> pd.Series:
 
 
 def queue_of(who: str, sampled: pd.DataFrame) -> list[str]:
-    """Return the units of a sample in the order of one person, by a seed of their own."""
+    """Return the units of a sample in one person's order, seeded by their name."""
     seed = annotation_protocol().seed
     return sorted(map(str, sampled["unit"]), key=lambda unit: digest([seed, who, unit]))
 

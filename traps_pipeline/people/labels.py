@@ -1,7 +1,7 @@
-"""People's labels as they are stored, and the tables made from them: labels of units of the study, and agreement.
+"""People's stored labels, and the tables built from them: labels of the study's units, and agreement.
 
-`traps people annotate` appends each label to `labels.jsonl`, one checked line a label; a later line of the same
-person about the same unit replaces the earlier one. Stages read that file alone.
+`traps people annotate` appends each label to `labels.jsonl`, one line with a checksum per label; a later line of the
+same person about the same unit replaces the earlier one. Stages read only that file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace
 
-MOST_CHARACTERS = 200  # of an answer
+MOST_CHARACTERS = 200  # limit of an answer
 DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
     "answerability": ("abstained",),
     "confabulation": AXES,
@@ -40,14 +40,14 @@ _STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
 class ClipLabel(BaseModel):
-    """What a person says about a clip and its question; answer is null where it cannot be known."""
+    """A person's answer about a clip and its question; null if it cannot be known."""
 
     model_config = _STRICT
     answer: str | None = Field(min_length=1, max_length=MOST_CHARACTERS)
 
 
-# Of the other tasks, a person states the decisions alone.
-_model: Any = create_model  # its fields are known at run time alone
+# In the other tasks, a person only states decisions.
+_model: Any = create_model  # its fields are known only at run time
 LABELS: Mapping[TaskName, type[BaseModel]] = {
     task: ClipLabel
     if task == "answerability"
@@ -70,8 +70,10 @@ class Line(BaseModel):
 
 
 def label_lines(folder: Path) -> list[Line]:
-    """Return the labels in a study's folder of labels, in order; none where nobody has labelled. Raises TrapsError for
-    a line that is not what was written; a last line that a crash cut off was never confirmed and is left out."""
+    """Return the labels in a study's folder of labels, in order; none if nobody has labelled.
+
+    Raises TrapsError for a damaged line; a last line that a crash cut off was never confirmed and is left out.
+    """
     path, lines = folder / LABELS_FILE, list[Line]()
     if not path.is_file():
         return lines
@@ -93,7 +95,7 @@ def label_lines(folder: Path) -> list[Line]:
 
 
 def human_labels(workspace: Workspace) -> pd.DataFrame:
-    """Return HUMAN_LABELS rows: the last label of each person about each unit that the study still has."""
+    """Return HUMAN_LABELS rows: each person's last label of each unit that the study still has."""
     last: dict[tuple[TaskName, str, str], dict[str, Any]] = {}
     for line in label_lines(workspace.labels):
         key = line.task, line.unit, line.who
@@ -114,7 +116,7 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
 
 
 def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with answers about clips read as models' are: abstained, and correct on a control."""
+    """Return the rows with answers about clips read like models' answers: abstained, and correct on a control."""
     columns = ["item_id", "ground_truth", "answer_type", "labels", "aliases"]
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS).set_index("item_id").to_dict("index")
 
@@ -163,8 +165,11 @@ def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str,
 
 
 def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
-    """Return of labels as `matrix` gives them: the units that two people or more labelled, the share of pairs of labels
-    of the same unit that are equal, and Krippendorff's alpha; NaN where undefined."""
+    """Return the agreement between labels in the form of `matrix`; NaN if undefined.
+
+    Three values: the number of units with two people or more, the share of equal pairs of labels of the same unit, and
+    Krippendorff's alpha.
+    """
     several = int(((values != INVALID).sum(axis=1) > 1).sum())
     pairs = [values[:, [a, b]] for a, b in combinations(range(values.shape[1]), 2)]
     shared = np.concatenate([both[(both != INVALID).all(axis=1)] for both in pairs] or [np.zeros((0, 2), np.int8)])
@@ -185,8 +190,10 @@ def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
 
 
 def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
-    """Return what most people say about each unit of ABOUT_ANSWERS: one row a unit, in the columns of HUMAN_LABELS and
-    `truth` (null where as many say yes as no)."""
+    """Return the majority of people about each unit of ABOUT_ANSWERS.
+
+    One row per unit, in the columns of HUMAN_LABELS and `truth` (null if as many say yes as no).
+    """
     if task not in ABOUT_ANSWERS:
         raise ValueError(f"{task}: the panel decides nothing of the kind")
     own = labels.loc[labels["task"] == task]
@@ -197,8 +204,10 @@ def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
 
 
 def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
-    """Return the labels of confabulation as `traps people validate` reads them, from HUMAN_LABELS rows: of failures
-    that everybody who labelled any has labelled. Raises TrapsError where there are none."""
+    """Return the confabulation labels in the form that `traps people validate` reads, from HUMAN_LABELS rows.
+
+    They cover failures that every annotator has labelled. Raises TrapsError if there are none.
+    """
     own = labels.loc[labels["task"] == "confabulation"]
     everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()
     shared = own.loc[everybody.to_numpy(bool)]

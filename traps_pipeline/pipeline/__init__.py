@@ -1,1 +1,1 @@
-"""The pipeline: how a stage is declared and made, which partitions a study wants, what is stale, who makes it anew."""
+"""The pipeline: declare stages, compute which partitions a study wants and which are stale, and materialize them."""

@@ -1,4 +1,4 @@
-"""Dagster's assets of the declared stages and sources."""
+"""Build Dagster's assets from the declared stages and sources."""
 
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack
@@ -9,7 +9,7 @@ from pydantic import PrivateAttr
 
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
-from traps_pipeline.pipeline.step import Event, guarded, run_step
+from traps_pipeline.pipeline.step import Event, guard_events, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -27,10 +27,10 @@ class WorkspaceResource(dg.ConfigurableResource):
     _steps: ExitStack = PrivateAttr(default_factory=ExitStack)
 
     def until_torn_down(self, events: Generator[Event, None, None]) -> Iterator[Event]:
-        """Pass a step's events on, and close the step when the run ends at the latest.
+        """Forward a step's events, and close the step when the run ends at the latest.
 
-        Dagster drops a step in the middle where it cannot write an event. Closed here, its calls in flight are stored
-        and its locks given back; the garbage collector would wait for ever for the threads of these calls.
+        Dagster abandons a step if it cannot write an event. Closing it here stores the calls in flight and releases its
+        locks; the garbage collector would wait forever for the threads of these calls.
         """
         self._steps.callback(events.close)
         return events
@@ -45,7 +45,7 @@ class WorkspaceResource(dg.ConfigurableResource):
 
 
 def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
-    """Return an asset of each stage, and an observable one of each source."""
+    """Return an asset for each stage, and an observable one for each source."""
     return [_asset(graph, one) if isinstance(one, Stage) else _observable(one) for one in graph.declared.values()]
 
 
@@ -92,14 +92,14 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
         ],
     )
     def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
-        events = guarded(run_step(stage, context, workspace.open()), context)
+        events = guard_events(run_step(stage, context, workspace.open()), context)
         yield from workspace.until_torn_down(events)
 
     return asset
 
 
 def _contract(table: Table) -> dict[str, Any]:
-    """Return a table's columns and the meaning of a row, as Dagster shows them."""
+    """Return a table's columns and the meaning of a row, in the form that Dagster shows."""
     columns = [
         dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
         for c in table.columns

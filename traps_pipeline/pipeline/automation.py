@@ -1,10 +1,10 @@
-"""Jobs that make a part of the study by one command or click, and sensors that follow corrections.
+"""Dagster jobs for parts of the study, and sensors that follow corrections.
 
-A job makes what is missing or stale of its stages for everything that the study's experiments ask. Dagster cannot run
+A job materializes the missing or stale partitions of its stages that the study's experiments want. Dagster cannot run
 assets of different partitions in one job, so a job whose stages have several is one op, which starts a run for each
-block of stages that share their partitions and links them; `report` selects its assets. The sensors target assets:
-they request runs of what is there and outdated. They look at the state of the tables, not at events, so that a
-correction that was made while they were off is followed, too.
+block of stages that share their partitions and links them; `report` selects its assets. The sensors target assets: they
+request runs of what exists and is outdated. They read the state of the tables, not events, so that they also follow a
+correction made while they were off.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ import dagster as dg
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import folded
+from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.models.judges import load_judges, load_panel
@@ -53,17 +53,17 @@ INTERVAL_S = 30
 
 
 def reread_sources() -> None:
-    """Forget what was read of specs, corrections, prompts and registries: a server that lives long sees edits then.
+    """Clear the caches of specs, corrections, prompts and registries, so that a long-lived server sees edits.
 
-    Which evaluations there are stays: partition keys are made from them when the code location is loaded.
+    The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
-    for cached in (load_released, folded, prompt, system_prompt, vqa_prompt, *registries):
+    for cached in (load_released, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
         cached.cache_clear()
 
 
 def jobs() -> list[Any]:
-    """Return a job for each part of the graph and one for all of it, once the stages are declared."""
+    """Return a job for each part of the graph and one for all of it. Call it after the stages are declared."""
     stages = the_graph().stages
     parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
     every = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
@@ -100,9 +100,9 @@ def _stages(costs: bool) -> list[Stage]:
 
 
 def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
-    """Fail the check `current` for altered or lost files, and assets without partitions that are not current.
+    """Fail the check `current` for altered or lost files, and for stale assets without partitions.
 
-    reported: what this process has reported before.
+    reported: the failures that this process has reported before.
     """
     partitions, history = StudyPartitions(workspace), History(instance, the_graph())
     for stage in the_graph().stages:
@@ -129,12 +129,12 @@ def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: 
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Return runs of what is outdated and can be made anew now. What waits for these is requested at a later look."""
+    """Return runs of what is outdated and can be rebuilt now; dependents are requested at a later tick."""
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)
         nodes = [(stage.name, key) for stage in stages for key in keys]
-        # What is outdated and stays so, with the same inputs, is tried once: it fails for a reason of its own.
+        # Try each outdated partition once per set of inputs: if it stays outdated, it fails for its own reasons.
         states = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
         for one in batches(block[0].scheme, keys):
             requests.append(
@@ -175,7 +175,7 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
 
 
 def sensors() -> list[dg.SensorDefinition]:
-    """Return the sensors that follow corrections, once the stages are declared."""
+    """Return the sensors that follow corrections. Call it after the stages are declared."""
     return [
         _sensor(
             "follow_corrections",

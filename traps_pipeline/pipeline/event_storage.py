@@ -1,9 +1,9 @@
-"""Dagster's SQLite storage with connections that are kept: an event costs a quarter of the time.
+"""Dagster's SQLite storage with persistent connections: an event costs a quarter of the time.
 
 For each event Dagster makes an engine, which compiles its statements anew, and opens and closes the file. Here the
-engine of a file is kept. Its commits go to SQLite's log beside the file, which Dagster's pages do not watch, so the
-file is touched after each that changes something. `dagster.yaml` names this class; a study may name another storage in
-its own.
+engine of a file is kept. Its commits go to SQLite's write-ahead log beside the file, which Dagster's pages do not
+watch, so each commit that changes something also touches the file. `dagster.yaml` names this class; a study may name
+another storage in its own `dagster.yaml`.
 """
 
 import contextlib
@@ -22,11 +22,11 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from traps_pipeline.base.databases import reason_and_remedy
 
 OPEN_FILES = 32  # at most: each run has a file of its own, and a server sees many
-_BUSY_S = 30  # for another process's lock, as Dagster itself waits
+_BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
 class HistoryUnwritable(OperationalError):
-    """A full, failing or read-only disk. Its message is ours: Dagster prints and stores it."""
+    """A full, failing or read-only disk. Dagster prints and stores this message, so it is ours."""
 
     sentence = ""
 
@@ -59,7 +59,7 @@ def _changes(connection: db.Connection) -> int:
 
 def _kept_engine(address: str) -> db.Engine:
     engine = db.create_engine(address, connect_args={"timeout": _BUSY_S})
-    # A power cut may take the last events, never the history; what counts stands in the tables' footers.
+    # A power cut may lose the last events, never the history; the tables' footers are authoritative.
     listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=NORMAL"))
     return engine
 
@@ -121,5 +121,5 @@ class SqliteStorage(DagsterSqliteStorage):
 
     @classmethod
     def from_config_value(cls, inst_data: Any, config_value: Any) -> "SqliteStorage":
-        """Make it of `dagster.yaml`, as Dagster asks for it."""
+        """Create the storage from `dagster.yaml`, as Dagster requires."""
         return cls.from_local(inst_data=inst_data, **config_value)

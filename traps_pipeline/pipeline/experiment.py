@@ -1,4 +1,4 @@
-"""An experiment: models and the questions that they are asked, as a YAML file in `assets/experiments` or elsewhere."""
+"""An experiment: the models and questions of a YAML file, in `assets/experiments` or elsewhere."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.models.judges import require_panel
-from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
+from traps_pipeline.models.user_registry import UserRegistry, add_entries
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SCHEMAS
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
@@ -26,7 +26,7 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(BaseModel):
-    """What `traps plan` counts and `traps run` runs; benchmark, scenarios, per_family and panel become the study's."""
+    """The fields of an experiment's file. benchmark, scenarios, per_family and panel are copied to the study."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name = Field(pattern=r"^[a-z0-9-]+$")
@@ -46,7 +46,7 @@ class Experiment(BaseModel):
     allow_unknown_prices: bool | None = None
     mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
     canary: bool = Field(default=False, description="ask twenty fixed items again in each epoch")
-    own: Own = Field(default=Own(), description="models, judges and panels that the file itself describes")
+    own: UserRegistry = Field(default=UserRegistry(), description="models, judges and panels of this file")
 
     @model_validator(mode="before")
     @classmethod
@@ -99,12 +99,12 @@ class Experiment(BaseModel):
 
     @model_validator(mode="after")
     def _study_holds_together(self) -> Experiment:
-        _ = self.study  # so that a study that would be invalid (two subsets, a wrong epoch) is an error of this file
+        _ = self.study  # report an invalid study (two subsets, a wrong epoch) as an error of this file
         return self
 
     @property
     def study(self) -> Study:
-        """The study in a new workspace for this experiment."""
+        """The study of a new workspace for this experiment."""
         fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd", "model_budgets_usd")
         fields += ("allow_unknown_prices", "mechanism", "judged_by_rules")
         values = {name: getattr(self, name) for name in fields}
@@ -112,14 +112,14 @@ class Experiment(BaseModel):
 
     @property
     def asked(self) -> Asked:
-        """The experiment's datasets, models, regimes and runs, in the form that the study keeps."""
+        """The experiment's datasets, models, regimes and runs, in the study's format."""
         values = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
         return Asked(**values, mechanism=self.mechanism is not None)
 
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
         """Return the study with the panel of the command, else of the experiment, else of a study (None: new).
 
-        Raises TrapsError for none, for two, and where rules would judge models that they are not made for unasked.
+        Raises TrapsError for no panel, for two, and if rules would judge models without an explicit request.
         """
         base = study or self.study
         if panel is not None and self.panel not in (None, panel):
@@ -131,9 +131,9 @@ class Experiment(BaseModel):
                 f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; edit one of them"
             )
         named = panel or (base.panel if study else self.panel) or self.panel or ""
-        by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
-        require_panel(named, self.models, judged_by_rules=by_rules)
-        return base.model_copy(update={"panel": named, "judged_by_rules": by_rules})
+        is_judged_by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
+        require_panel(named, self.models, judged_by_rules=is_judged_by_rules)
+        return base.model_copy(update={"panel": named, "judged_by_rules": is_judged_by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
         """Raise TrapsError if an existing study has another panel, epoch or `mechanism` section than this one."""
@@ -148,7 +148,10 @@ class Experiment(BaseModel):
             )
 
     def cells(self) -> list[Cell]:
-        """Return all cells, by model; one with fewer runs has fewer. Raises TrapsError for an unknown model."""
+        """Return all cells, by model; a model with fewer runs has fewer cells.
+
+        Raises TrapsError for an unknown model.
+        """
         cells = []
         for model in self.models:
             available = get_model(model).runs
@@ -177,7 +180,7 @@ def load_experiment(name: str) -> Experiment:
             f"of a YAML file{did_you_mean(name, known)}"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
-    use(experiment.own, path)
+    add_entries(experiment.own, path)
     with within(path):
         for model in experiment.models:
             get_model(model)

@@ -1,4 +1,4 @@
-"""`traps run`: what is checked before an experiment is run, the run, and what it did."""
+"""Run an experiment (`traps run`): preflight checks, the run, and a report of its work."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs
 
 @dataclass
 class RunReport:
-    """What a run did: problems in sentences, whether a budget ended it, seconds, and the work of each stage."""
+    """A run's result: problems as sentences, whether a budget ended it, seconds, and the work of each stage."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -44,7 +44,7 @@ class RunReport:
 
     @property
     def frames(self) -> int:
-        """How many frames were rendered."""
+        """Number of rendered frames."""
         return sum(tally.frames for tally in self.tallies.values())
 
 
@@ -57,12 +57,11 @@ def run_experiment(
     look_at_machine: bool,
     open_runs: OpenRuns,
 ) -> RunReport:
-    """Make every missing or stale partition of an experiment; progress is reported to `progress.current()`.
+    """Materialize every missing or stale partition of an experiment; report to `progress.current()`.
 
-    until: stages with commas between, to make these and what they need alone. preflight: is given
-    a line about each model and judge, which are tried first where it is not None.
-    open_runs: opens what makes the runs; called only where there is something to make, as is Dagster's history.
-    Raises TrapsError where a run cannot begin.
+    until: comma-separated stages; only these and their upstream are materialized. preflight: receives a line about each
+    model and judge, which are tried first unless it is None. open_runs: opens the executor of runs; called, like
+    Dagster's history, only if there is something to materialize. Raises TrapsError if a run cannot begin.
     """
     stages = stages_until(until)
     require_work(workspace, experiment.name, until)
@@ -90,14 +89,14 @@ def run_experiment(
 
 @dataclass(frozen=True)
 class _Participants:
-    """Models and judges that still have something to answer, and whose libraries or keys may be missing here."""
+    """Models and judges with answers still missing, whose libraries or keys may be missing here."""
 
     models: list[Entry]
     judges: list[Entry]
 
 
 def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
-    """Return the models and judges that the ledger does not hold all answers of."""
+    """Return the models and judges whose answers are not all in the ledger."""
     lineage, cells = Lineage(workspace), StudyPartitions(workspace, experiment.name).cells
 
     def behind(stage: str) -> Iterator[str]:
@@ -114,7 +113,7 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
 
 
 def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
-    """Try the models and judges over the network first. Raises TrapsError naming all that is wrong."""
+    """Try the models and judges over the network first. Raises TrapsError naming all problems."""
     models = [entry for entry in participants.models if entry.backend == NETWORK]
     if not models and not participants.judges:
         return
@@ -122,6 +121,6 @@ def _preflight(workspace: Workspace, participants: _Participants, say: Callable[
 
     checks = preflight(workspace, models, participants.judges)
     for check in checks:
-        if not check.problems:  # they are what is raised
+        if not check.problems:  # they are raised instead
             say(check.line)
     require_sound(checks)

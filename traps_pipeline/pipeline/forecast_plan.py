@@ -1,4 +1,4 @@
-"""`traps plan`: the calls that an experiment would make, with their tokens, dollars and minutes, and GPU-hours."""
+"""Plan an experiment (`traps plan`): count its calls, and forecast tokens, dollars, minutes and GPU-hours."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ LABEL_TOKENS = 2500  # estimated prompt of a label: instructions, answer and, fo
 
 @dataclass
 class Count:
-    """Numbers of calls: wanted, and of these already in the ledger (known)."""
+    """Numbers of calls: all that are wanted, and those already in the ledger (known)."""
 
     wanted: int = 0
     known: int = 0
 
     @property
     def new(self) -> int:
-        """The number of calls still to be made."""
+        """The number of calls still to be sent."""
         return self.wanted - self.known
 
     def add(self, wanted: int, known: int) -> None:
@@ -53,11 +53,14 @@ class Count:
 
 @dataclass(frozen=True)
 class Plan:
-    """The calls of an experiment. calls: answers and votes by model. uncertain: datasets with items that are unknown
-    before a run has made them; their calls are counted as new, which is an upper bound. forecasts: tokens,
-    dollars and minutes of the new calls over the network, by model and judge. labels: calls to the confabulation judge;
-    None if the study's panel has none. steered: answers of steered models and votes on them, by model. pairs: how many
-    there are, by dataset. local: what local models take of a card."""
+    """The calls of an experiment.
+
+    calls: answers and votes by model. uncertain: datasets with items that are unknown before a run has made them; their
+    calls are counted as new, which is an upper bound. forecasts: tokens, dollars and minutes of the new calls over the
+    network, by model and judge. labels: calls to the confabulation judge; None if the study's panel has none. steered:
+    answers of steered models and votes on them, by model. pairs: their number by dataset. local: GPU costs of local
+    models.
+    """
 
     calls: Mapping[str, tuple[Count, Count]]
     uncertain: Sequence[str]
@@ -69,14 +72,14 @@ class Plan:
 
     @property
     def minutes(self) -> float:
-        """Of all calls: models are asked side by side, and then judges."""
+        """Minutes of all calls: models run in parallel, and then judges."""
         models = [row for row in self.forecasts if row.participant in self.calls]
         judges = [row for row in self.forecasts if row.participant not in self.calls]
         return minutes_of(models) + minutes_of(judges)
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
-    """Count the calls of an experiment and forecast their cost; nothing is sent or made.
+    """Count the calls of an experiment and forecast their cost, without sending or writing anything.
 
     study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
     """
@@ -109,7 +112,7 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
-    """Return calls for the answers of steered models, and for the panel's votes on them, by model."""
+    """Return the number of calls for steered models' answers and for the panel's votes on them, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
         return counts
@@ -136,7 +139,7 @@ def _local_costs(
     calls: Mapping[str, tuple[Count, Count]],
     steered: Mapping[str, tuple[Count, Count]],
 ) -> Iterator[Cost]:
-    """Yield what local models take of a card: new answers, and all passes of states and patches of a new model."""
+    """Yield each local model's GPU cost: new answers, and all passes for states and patches of a new model."""
     settings, scenarios = experiment.mechanism, load_scenarios(study).values()
     taxonomies = Counter(datasets_of_category(scenario.category)[0] for scenario in scenarios)
     for model in dict.fromkeys([*calls, *(settings.models if settings else ())]):
@@ -159,7 +162,7 @@ def _local_costs(
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
-    """Return calls to the confabulation judge; a model that is not judged yet counts with a full sample."""
+    """Return calls to the confabulation judge; a model without verdicts counts with a full sample."""
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
     labels, lineage = Count(), Lineage(workspace) if workspace else None
     for model in protocol.models:
@@ -199,7 +202,7 @@ def _count_calls(
         votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unmade.items()), 0)
         if workspace is None or lineage is None:
             continue
-        # A fresh cell of current items has all that it wants: neither are its keys made again nor is its ledger read.
+        # A fresh cell of current items is complete: skip building its keys and reading its ledger.
         answered, cast = (_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
         if answered is not None and cast is not None and cell.dataset in current:
             answers.add(answered, answered)
@@ -212,7 +215,7 @@ def _count_calls(
 def _items(
     workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
-    """Return the items that the next run asks of a dataset, and by side how many are unknown before it made them."""
+    """Return a dataset's items in the next run, and by side the number that are unknown before that run."""
     unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
     if workspace is None or lineage is None or lineage.state("items", dataset) is None:
         return [], unmade
@@ -236,7 +239,7 @@ def _count_cell(
     answers: Count,
     votes: Count,
 ) -> None:
-    """Count a cell's calls: votes on known answers by their own keys, and all votes on answers still to be asked."""
+    """Count a cell's calls: votes on known answers by their own keys, and every vote on answers still missing."""
     entry, folder = get_model(cell.evaluation.model), cell.evaluation.key
     keys = {  # an item without media was never asked
         item["item_id"]: answer_request(workspace, entry, item, cell.evaluation).key
@@ -271,7 +274,7 @@ def _items_current(lineage: Lineage, dataset: str) -> bool:
 
 
 def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
-    """Return the partitions of a dataset's items and of what they are made from, as far as they are there."""
+    """Return the existing partitions of a dataset's items and of everything upstream of them."""
     parents = lineage.graph.parents("items", dataset).items()
     above = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
     return [node for node in above if lineage.state(*node)]

@@ -1,7 +1,7 @@
-"""What each partition is made from, which keys there are, and in which order.
+"""The dependency graph: each partition's upstream partitions, all keys, and the order of stages.
 
-`stage` and `source` (`pipeline.stage`) are the only declarations. Nothing here imports Dagster: `traps status`,
-`why` and `plan` read this graph and the tables' footers alone, and `pipeline.assets` makes Dagster's assets of it.
+`stage` and `source` (`pipeline.stage`) are the only declarations. Nothing here imports Dagster: `traps status`, `why`
+and `plan` read only this graph and the tables' footers, and `pipeline.assets` builds Dagster's assets from it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from traps_pipeline.storage.workspace import Workspace
 Node = tuple[str, str | None]  # stage or source, and its partition key
 UpstreamPolicy = Literal["every", "some", "none"]
 Cost = Literal["", "money", "machine"]
-# Each job and the groups of assets that it makes. Every group stands here once, in the order in which groups are made.
+# Each job and the groups of assets that it materializes. Every group occurs once, in order of execution.
 JOB_GROUPS: Mapping[str, tuple[str, ...]] = {
     "benchmark": ("benchmark", "arms"),
     "evaluation": ("evaluation",),
@@ -36,7 +36,10 @@ GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
 
 @dataclass(frozen=True)
 class Check:
-    """A check of each partition. wrong: what is wrong, or empty; blocks: nothing is made from one that fails."""
+    """A check of each partition.
+
+    wrong: returns the failure, or empty; blocks: a failure blocks everything downstream.
+    """
 
     name: str
     doc: str
@@ -46,8 +49,11 @@ class Check:
 
 @dataclass(frozen=True)
 class Parent:
-    """What a stage is made from. mapping: which of its partitions (default: that of the same key where both are
-    partitioned alike, else every one); need: how much of what the study wants of them must be there."""
+    """An upstream asset of a stage.
+
+    mapping: selects its partitions (default: the same key if both are partitioned alike, else all). need: how many of
+    the partitions that the study wants must exist.
+    """
 
     name: str
     mapping: KeyMapping | None = None
@@ -56,7 +62,7 @@ class Parent:
 
 @dataclass(frozen=True)
 class Source:
-    """Something that people edit. version: of its content, by partition where it has any."""
+    """A file or setting that people edit. version: returns its data version, by partition if it has any."""
 
     name: str
     version: Callable[[Workspace, Any], str]
@@ -68,9 +74,11 @@ class Source:
 
 @dataclass(frozen=True)
 class RunResources:
-    """What a run of a stage takes of a host, for a cluster to set aside. memory_gb: 0 where it does not matter.
-    each_gb: of a stage that works on all cores that it is given (`traps run --cpus`), the memory of each besides; 0: it
-    works on one. A stage whose cost is `machine` takes a GPU besides, where `traps run --gpus` says so."""
+    """The resources that a cluster reserves for a run of a stage.
+
+    memory_gb: 0 if it does not matter. each_gb: for a stage that uses all cores it is given (`traps run --cpus`), extra
+    memory per core; 0: it uses one core. A stage whose cost is `machine` also takes a GPU, as `traps run --gpus` says.
+    """
 
     memory_gb: float = 0.0
     each_gb: float = 0.0
@@ -82,10 +90,12 @@ def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
 
 @dataclass(frozen=True)
 class ConcurrentBuild:
-    """How several runs make one partition: the files that it names beside one another, and then one of them the
-    partition, which the others take over as made. files: makes what nobody else is at, then waits, if it is told to,
-    until nothing is missing; what was done here, and whether all is there. seconds: about how long one core works at
-    what is missing, as far as that is known before anything above is made."""
+    """How several runs build one partition: together its files, and then one of them the partition itself.
+
+    The other runs adopt the finished partition. files: makes the files that no other run is making, optionally waits
+    until none is missing, and returns the work done here and whether all exist. seconds: estimates one core's time for
+    the missing files, as far as that is known before anything upstream exists.
+    """
 
     files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _nothing
     seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
@@ -93,12 +103,13 @@ class ConcurrentBuild:
 
 @dataclass(frozen=True)
 class Stage:
-    """Something that is made: a table, or files for people (table: None).
+    """The declaration of an asset that is built: a table, or files for people (table: None).
 
-    make: returns the StageOutput of a key; of `side_by_side`, it takes several keys and yields each with its own.
-    code: raise it when the formula changes, and what was made before is stale. cost: what making it takes besides
-    seconds. wants: whether a study wants a key at all. lost: what is missing of the files that a partition names.
-    takes: what a run of it takes of a host. shared: how several runs make a partition at once, where they may.
+    make: returns the StageOutput of a key; if `side_by_side`, takes several keys and yields each with its own. code:
+    the code version; raise it when the formula changes, so that existing partitions become stale. cost: the main
+    resource it uses besides time. wants: whether a study wants a key at all. lost: returns the missing files that a
+    partition names. takes: the resources of a run on a host. shared: how several runs build a partition together, if
+    they may.
     """
 
     name: str
@@ -128,18 +139,18 @@ class Stage:
         return [key for key in keys if self.wants(partitions, key)]
 
 
-DECLARED: dict[str, Stage | Source] = {}  # by name; filled as `defs` is loaded
+DECLARED: dict[str, Stage | Source] = {}  # by name; filled as stages are imported
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Stages and sources, their keys, and what each partition is made from."""
+    """All stages and sources, their keys, and each partition's upstream partitions."""
 
     declared: Mapping[str, Stage | Source] = field(default_factory=lambda: DECLARED)
 
     @cached_property
     def parents_of(self) -> Mapping[str, Mapping[str, Parent]]:
-        """What a stage is made from, by name; nothing for a source."""
+        """Upstream assets of each stage, by name; empty for a source."""
         return {name: one.parents if isinstance(one, Stage) else {} for name, one in self.declared.items()}
 
     def __getitem__(self, name: str) -> Stage:
@@ -160,8 +171,11 @@ class Graph:
         return [name for name, one in self.declared.items() if isinstance(one, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
-        """Return stages (default: all) in order, those together that can be made in one run: they share a scheme, and
-        nothing of another scheme stands between them. Among what is ready, the groups come in the order of `GROUPS`."""
+        """Return stages (default: all) in order, grouped into blocks that one run can materialize.
+
+        The stages of a block share a scheme, and no stage of another scheme lies between them. Ready stages follow the
+        order of `GROUPS`.
+        """
         remaining = {
             name: one
             for name, one in self.declared.items()
@@ -183,11 +197,11 @@ class Graph:
 
     @cached_property
     def stages(self) -> list[Stage]:
-        """All stages, in an order in which each finds its inputs made."""
+        """All stages, in topological order."""
         return [stage for block in self.blocks() for stage in block]
 
     def above(self, names: Iterable[str]) -> set[str]:
-        """Return the stages of these names, and all that they are made from."""
+        """Return the stages of these names, and all stages upstream of them."""
         ancestors, remaining = set[str](), [*names]
         while remaining:
             name = remaining.pop()
@@ -197,7 +211,7 @@ class Graph:
         return ancestors
 
     def below(self, name: str) -> set[str]:
-        """Return the stages that are made directly from one."""
+        """Return the stages directly downstream of a stage."""
         return {child for child, parents in self.parents_of.items() if name in parents}
 
     @cache  # noqa: B019 - a graph lives as long as its process
@@ -208,10 +222,10 @@ class Graph:
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
-        """Return every partition that one may be made from, whether it is there or not, by stage or source."""
+        """Return every partition upstream of one, existing or not, by stage or source."""
         scheme = self.declared[name].scheme
         if key is not None and (scheme is None or key not in scheme.known):
-            return {}  # of an experiment that the study has no more
+            return {}  # a key of an experiment that was removed from the study
         return {
             parent.name: [None] if (above := self.declared[parent.name].scheme) is None
             else self.mapping(name, parent.name).above(key, scheme, above)
@@ -219,7 +233,7 @@ class Graph:
         }  # fmt: skip
 
     def mapping(self, name: str, parent: str) -> KeyMapping:
-        """Return which partitions of a partitioned parent a stage is made from."""
+        """Return the mapping that selects a partitioned parent's partitions for a stage."""
         scheme, stated = self.declared[name].scheme, self.parents_of[name][parent].mapping
         return stated or (SAME if scheme is self.declared[parent].scheme else EVERY)
 
@@ -231,7 +245,7 @@ def name_of(node: Node) -> str:
 
 @cache
 def the_graph() -> Graph:
-    """Return the graph of everything that is declared, once `traps_pipeline.pipeline.stages` is imported."""
+    """Return the graph of all declarations, once `traps_pipeline.pipeline.stages` is imported."""
     if not DECLARED:
         raise RuntimeError("no stage is declared yet: import traps_pipeline.pipeline.stages first")
     return Graph()

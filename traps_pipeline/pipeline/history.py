@@ -1,4 +1,4 @@
-"""What Dagster is told of each partition and source, and what it knows: data versions and where they came from."""
+"""Report partitions and sources to Dagster, and read back its data versions and their provenance."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class History:
     def event(
         self, stage: Stage, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
     ) -> dg.AssetMaterialization:
-        """Return the event that makes a partition count as made, with its data version and what it was made from."""
+        """Return the event that records a partition as materialized, with its data version and provenance."""
         tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
         return dg.AssetMaterialization(
             asset_key(stage.name), partition=key, metadata=visible_metadata(metadata), tags=tags
         )
 
     def provenance(self, stage: Stage) -> dict[str, str]:
-        """Return tags that say which events of the parents are current. Taken before anything is read."""
+        """Return tags that name the parents' current events. Call it before any input is read."""
         tags: dict[str, str] = {}
         for parent in stage.parents:
             key = asset_key(parent)
@@ -47,7 +47,7 @@ class History:
         return tags
 
     def recorded(self, name: str) -> dict[str | None, str | None]:
-        """Return the data version that Dagster knows of each partition of a stage or source."""
+        """Return the data versions in Dagster's history, by partition of a stage or source."""
         node = self._graph.declared[name]
         if node.scheme is None:
             records = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
@@ -58,7 +58,7 @@ class History:
         return {key: of[_VERSION] for key, of in tags.items()}
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
-        """Tell Dagster the versions of sources (default: all) that it does not know yet; returns those that changed."""
+        """Report versions of sources (default: all) that Dagster does not know yet; return those that changed."""
         changed = list[Node]()
         for name in self._graph.sources if sources is None else sources:
             now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}
@@ -80,7 +80,7 @@ class History:
         return self._instance.fetch_observations if source else self._instance.fetch_materializations
 
 
-# By history and source: versions when this process last told them. A run has many steps, and each would look again.
+# Versions last reported by this process, by history and source: saves each of a run's many steps a query.
 _OBSERVED: dict[tuple[Path, str], dict[str | None, str]] = {}
 
 

@@ -1,8 +1,8 @@
-"""What each partition was made from, and whether that is still what is there.
+"""Compare each partition's recorded inputs with the current ones: the source of truth about staleness.
 
-The truth lies in the tables' footers (`storage.parquet.State`): the versions of the inputs at the time of writing. A
-partition is stale when an input's version is another now. Dagster is told the same versions, so its UI agrees; this
-module also answers where Dagster does not: unpartitioned assets, more than 100 upstream partitions, lost files, altered
+The tables' footers hold the truth (`storage.parquet.State`): the versions of the inputs at the time of writing. A
+partition is stale when an input's version has changed. Dagster gets the same versions, so its UI agrees; this module
+also answers where Dagster does not: unpartitioned assets, more than 100 upstream partitions, lost files, altered
 tables, failed calls.
 """
 
@@ -21,12 +21,12 @@ from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace
 
-DAMAGED = "damaged"  # the version of what cannot be believed
+DAMAGED = "damaged"  # the version of damaged data
 
 
 @dataclass(frozen=True)
 class Status:
-    """fresh, stale (with what changed, and how many calls failed) or missing."""
+    """A partition's status: fresh, missing, or stale (with changed inputs and the number of failed calls)."""
 
     kind: Literal["fresh", "stale", "missing"]
     outdated: tuple[str, ...] = ()
@@ -39,7 +39,7 @@ class Status:
 
 
 class Lineage:
-    """A view of a workspace at one moment; versions are looked up once. thorough: every table is read whole."""
+    """A snapshot view of a workspace; each version is looked up once. thorough: read every table in full."""
 
     def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
@@ -49,7 +49,7 @@ class Lineage:
         self._there = cache(self._keys_there)
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
-        """Return versions of everything that is there to make a partition from, by name."""
+        """Return the versions of all existing inputs of a partition, by name."""
         nodes = [
             (parent, k)
             for parent, keys in self.graph.parents(stage, key).items()
@@ -60,7 +60,7 @@ class Lineage:
         return {name: version for name, version in versions.items() if version is not None}
 
     def status(self, name: str, key: str | None) -> Status:
-        """Return whether a partition is there, whole, and made from what is there now by the code that is there now."""
+        """Return whether a partition exists, is undamaged, and matches the current inputs and code."""
         stage = self.graph[name]
         if damage := self.damage(name, key):
             return Status("stale", (damage,))
@@ -73,7 +73,7 @@ class Lineage:
         return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def made_at(self, name: str, key: str | None) -> int:
-        """Return when a partition was written (ns since 1970); 0 where there is none."""
+        """Return when a partition was written (ns since 1970); 0 if it does not exist."""
         stage = self.graph[name]
         path = _report_state(self._workspace, stage)
         if stage.table is not None:
@@ -81,7 +81,7 @@ class Lineage:
         return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
-        """Return why a partition cannot be made, in words; empty where it can. current: parents must be so, too."""
+        """Return why a partition cannot be materialized, in words; empty if it can. current: require fresh parents."""
         stage = self.graph[name]
         for parent, keys in self.graph.parents(name, key).items():
             if self.graph.source(parent) is not None:
@@ -100,8 +100,11 @@ class Lineage:
         return ""
 
     def waits(self, name: str, key: str | None) -> bool:
-        """Return whether something above is outdated, is gone since this was made, or must be made first, but for paid
-        things that are not needed."""
+        """Return whether a partition must wait for an upstream one.
+
+        That is so if an upstream partition is outdated, has been lost since this one was made, or is missing; paid
+        parents that are not required do not count.
+        """
         of_stage = self.graph[name].parents
         parents = {
             parent: keys
@@ -116,7 +119,7 @@ class Lineage:
         )
         return (
             any(self.status(*node).outdated for node in above)
-            or any(gone)  # without it, figures would be made anew from less than before
+            or any(gone)  # otherwise figures would be rebuilt from fewer inputs than before
             or bool(self.blocked(name, key, current=True))
         )
 
@@ -133,8 +136,7 @@ class Lineage:
         return f"does not pass its check {failed[0]}" if failed else ""
 
     def _keys_there(self, name: str) -> Set[str] | None:
-        """Return the keys of a table's files, since a study has few of all that there could be; None for what has no
-        partitions in a table."""
+        """Return the keys of a table's files, which are few; None for an asset without partitions in a table."""
         if self.graph.source(name) is not None or (stage := self.graph[name]).table is None or stage.scheme is None:
             return None
         files = (tuple(partition.values()) for partition in self._workspace.tables.partitions(stage.table))
@@ -175,12 +177,12 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[st
 
 
 def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None:
-    """Write what a stage's files for people were made from, in a folder beside them."""
+    """Write the lineage of a stage's files for people, in a folder beside them."""
     workspace.store.write({_report_state(workspace, stage): json.dumps(asdict(state)).encode()})
 
 
 def read_report_state(workspace: Workspace, stage: Stage) -> State | None:
-    """Return the state that `write_report_state` wrote; None if the files were never made."""
+    """Return the state that `write_report_state` wrote; None if the files do not exist."""
     path = _report_state(workspace, stage)
     if not workspace.store.has(path):
         return None

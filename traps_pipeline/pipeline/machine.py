@@ -1,4 +1,4 @@
-"""Look at the machine before a run: whether it has what the stages to come need, in seconds and in one sentence."""
+"""Check before a run, within seconds, that the machine has what the coming stages need."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import dagster as dg
 
-LEAST_GB = 0.1  # less is gone before a run has made its first tables
+LEAST_GB = 0.1  # less would run out before the first tables are written
 SHOWN = 5  # partitions in a sentence
 CLIPS = "mp4"  # the kind of a stage that renders
 
@@ -30,13 +30,13 @@ Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a ru
 
 
 def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
-    """Return what a study wants of these stages, or one experiment of it."""
+    """Return the partitions of these stages that a study, or one of its experiments, wants."""
     partitions = StudyPartitions(workspace, experiment)
     return {stage.name: stage.wanted(partitions) for stage in the_graph().stages if stage.name in stages}
 
 
 def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
-    """Return the stages of a Dagster run that share a step's partitions, each with those that the study wants."""
+    """Return the stages of a Dagster run that share a step's partitions, each with its wanted keys."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in selected}
@@ -45,7 +45,7 @@ def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: St
 
 
 def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
-    """Return in words why a run with these keys, none of which is wanted, has nothing to make."""
+    """Return in words why a run whose keys are all unwanted has nothing to do."""
     if keys:
         return f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:SHOWN]))}"
     first, last = (tags.get(f"dagster/asset_partition_range_{end}", "its end") for end in ("start", "end"))
@@ -53,10 +53,10 @@ def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: 
 
 
 def require_machine(workspace: Workspace, parts: Parts) -> None:
-    """Check what a run still needs for these partitions: disk, OpenGL and codecs, proxies and certificates.
+    """Check disk, OpenGL, codecs, proxies and certificates, as far as these partitions still need them.
 
-    Raises TrapsError, one sentence, for the first that is missing or that a variable keeps from working. A study whose
-    clips exist needs no OpenGL, and one whose answers and votes exist no network.
+    Raises TrapsError, one sentence, for the first that is missing or that a variable breaks. A study whose clips exist
+    needs no OpenGL, and one whose answers and votes exist needs no network.
     """
     check_disk(workspace.root, LEAST_GB)
     if any(entry.backend == NETWORK for entry in _asked(workspace, parts)):
@@ -69,7 +69,7 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
 
 
 def _asked(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
-    """Yield the models and judges of cells whose answers or votes are not there."""
+    """Yield the models and judges of cells whose answers or votes are missing."""
     lineage = Lineage(workspace)
     for name, keys in parts.items():
         stage = the_graph()[name]
@@ -87,5 +87,5 @@ def _asked(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
 
 @cache
 def _check_rendering(*_: tuple[str, str]) -> None:
-    """Check it once a process for the same variables."""
+    """Check rendering once per process and set of variables."""
     check_rendering()

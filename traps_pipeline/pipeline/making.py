@@ -1,4 +1,4 @@
-"""Make a stage's partitions in one run, alone or beside other runs that make the same ones."""
+"""Build a stage's partitions in one run, alone or concurrently with other runs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-Inputs = Mapping[str | None, Mapping[str, str]]  # versions of what each partition is made from
+Inputs = Mapping[str | None, Mapping[str, str]]  # versions of each partition's inputs
 
 
 class PartitionMaker:
-    """Makes partitions of a stage, each as it is done.
+    """Builds partitions of a stage, and yields each as soon as it is done.
 
-    unmade: those that could not be made, with the reason; the others are made all the same. taken: those that another
-    run has made meanwhile, with their version and what was done here for them.
+    unmade: partitions that failed, with the reason; the others are built all the same. taken: partitions that another
+    run finished meanwhile, with their version and the work done for them here.
     """
 
     def __init__(self, workspace: Workspace, stage: Stage, history: History) -> None:
@@ -32,7 +32,7 @@ class PartitionMaker:
         self._made_at: dict[str | None, int] = {}
 
     def make(self, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make a partition for each key of `inputs`, which were looked up before anything was read."""
+        """Build a partition for each key of `inputs`, which must be read before any data."""
         if self._stage.side_by_side:
             yield from self._side_by_side([*inputs])
         elif self._stage.shared is None:
@@ -51,7 +51,7 @@ class PartitionMaker:
             self.unmade |= dict.fromkeys(pending, error)
 
     def _one(self, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make one. tally: the work that was done for it before."""
+        """Build one partition. tally: the work that was done for it before."""
         try:
             output = self._stage.make(self._workspace, key)
         except TrapsError as error:
@@ -63,7 +63,7 @@ class PartitionMaker:
     # --- beside other runs --------------------------------------------------------------------------------------------
 
     def _beside_others(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make files that no other run is at, wait for theirs; the holder of its lease makes a partition."""
+        """Make files that no other run is making, wait for theirs; the lease holder builds the partition."""
         store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
         self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
         with kept_workers():
@@ -84,7 +84,7 @@ class PartitionMaker:
                             yield from self._one(key, tally)
 
     def _make_files(self, shared: ConcurrentBuild, key: str | None, tally: Tally, *, wait: bool) -> bool:
-        """Make files that a partition names, add what was done to the tally, and return whether all are there."""
+        """Make a partition's files, add the work to the tally, and return whether all exist."""
         try:
             done, is_whole = shared.files(self._workspace, key, wait)
         except TrapsError as error:
@@ -94,7 +94,7 @@ class PartitionMaker:
         return is_whole
 
     def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
-        """Return whether another run has made a partition of the same inputs meanwhile, and told Dagster of it."""
+        """Return whether another run has built a partition from the same inputs and reported it to Dagster."""
         stage, lineage = self._stage, Lineage(self._workspace)
         state = lineage.state(stage.name, key)
         if state is None or lineage.made_at(stage.name, key) == self._made_at[key]:

@@ -1,4 +1,4 @@
-"""Metadata of Dagster's events, in which nothing that a model or a provider wrote can hide."""
+"""Metadata of Dagster's events, with hidden characters in models' and providers' texts made visible."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are bet
 
 
 def visible_metadata(value: Any) -> Any:
-    """Return a value of an event's metadata, or a mapping or list of them, with hidden characters made visible."""
+    """Return a value of an event's metadata, or a mapping or list of them, with hidden characters visible."""
     if isinstance(value, str):
         return visible(value)
     if isinstance(value, Markdown):
@@ -42,7 +42,7 @@ def visible_metadata(value: Any) -> Any:
 
 
 def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) -> dict[str, Any]:
-    """Return what Dagster shows of a partition or of files for people."""
+    """Return the metadata that Dagster shows of a partition or of files for people."""
     counts: dict[str, Any] = {name: count for name, count in vars(output.tally).items() if count}
     if stage.table is None:
         files = cast(Mapping[str, bytes], output.content)

@@ -1,4 +1,4 @@
-"""The checks of a stage's partitions: what Dagster shows of them, and what a run says at its end."""
+"""Evaluate the checks of a stage's partitions, for Dagster and for the run's final report."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from traps_pipeline.storage.workspace import Workspace
 CURRENT = "current"  # the check that every stage has
 CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
 REACHED = "a budget is reached"  # in a check's metadata
-STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
+STILL = "still failing"  # in a check's metadata: set for a partition that the run did not touch
 SHOWN = 12  # unmade partitions named in an error
 
 
 class StageChecks:
     """Evaluates the checks of one stage in one run.
 
-    A failure is kept in the workspace until the partition passes, so that each later run and `traps status` tell of it,
+    A failure is stored in the workspace until the partition passes, so that each later run and `traps status` report it
     even if this run dies before it reports to Dagster.
 
-    The evaluations are no `AssetCheckResult`s: where a blocking one of those fails, Dagster fails the step and skips
-    everything below it, also what can do without. `Lineage.blocked` keeps what cannot from being made.
+    The evaluations are not `AssetCheckResult`s: if a blocking one of those fails, Dagster fails the step and skips
+    everything downstream, including stages that do not need this partition. `Lineage.blocked` blocks the ones that do.
     """
 
     def __init__(self, workspace: Workspace, graph: Graph, stage: Stage) -> None:
@@ -39,7 +39,7 @@ class StageChecks:
         self._failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}
 
     def of_parents(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate, before anything is made from them, the parents that are not what was written."""
+        """Evaluate the parents whose content was altered, before anything is built from them."""
         for parent, keys in self._graph.parents(self._stage.name, key).items():
             if self._graph.source(parent) is None:
                 for above in keys:
@@ -47,7 +47,7 @@ class StageChecks:
                         yield _evaluation(parent, CURRENT, above, {"damaged": damage})
 
     def of_made(self, key: str | None, output: StageOutput) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate every check of a partition that was just written."""
+        """Evaluate every check of a partition just written."""
         stage, wrong = self._stage, dict[str, Any]()
         if stage.table is not None:
             damage = self._workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
@@ -66,11 +66,11 @@ class StageChecks:
             yield self._evaluate(check.name, key, {"failing": plain} if problems else {})
 
     def of_unmade(self, key: str | None, error: TrapsError) -> dg.AssetCheckEvaluation:
-        """Evaluate a partition that could not be made."""
+        """Evaluate a partition that could not be built."""
         return self._evaluate(CURRENT, key, {"not made": str(error), REACHED: isinstance(error, BudgetReached)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate again what fails, seen or not: Dagster shows a check's newest result alone."""
+        """Re-evaluate failing checks, including unchanged ones: Dagster shows only a check's newest result."""
         name = self._stage.name
         for key in self._graph.keys(name):
             if key not in seen:
@@ -89,9 +89,9 @@ class StageChecks:
 
 
 def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) -> None:
-    """Raise TrapsError, or BudgetReached, for all that this run has not made or that fails, up to a stage.
+    """Raise TrapsError, or BudgetReached, for all failures of this run, up to a stage.
 
-    Had the step above raised, Dagster would have made nothing below it, not even what is sound.
+    An error in an upstream step would have made Dagster skip everything downstream, including what is sound.
     """
     above, failed = graph.above([last]), dict[tuple[str, Node], dg.AssetCheckEvaluation]()
     of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
@@ -100,7 +100,7 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
         node = (event.asset_key.path[-1], event.partition)
         if node[0] in above and STILL not in event.metadata:
             failed[event.check_name, node] = event
-    alike: dict[tuple[str, str], list[str]] = {}  # by stage and what is said: a reason is told once
+    alike: dict[tuple[str, str], list[str]] = {}  # by stage and message: each reason is reported once
     for (check, node), event in failed.items():
         for line in _lines(check, node, event):
             alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
@@ -122,7 +122,7 @@ def _failed_calls(count: int) -> str:
 
 
 def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterator[str]:
-    """Yield what a failed check says, a line each."""
+    """Yield the message of a failed check, one line at a time."""
     if event.passed:
         return
     for name, value in ((name, value.value) for name, value in event.metadata.items() if name != REACHED):

@@ -1,6 +1,6 @@
-"""Ways of partitioning, and which partitions of a parent one is made from, without Dagster.
+"""Partitioning schemes, and mappings between partitions, without Dagster.
 
-Dagster's import alone takes longer than `traps status`; `pipeline.translation` puts these words into Dagster's.
+Importing Dagster takes longer than `traps status`; `pipeline.translation` translates these classes into Dagster's.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ SEPARATOR = "|"  # between the two dimensions of a key, as Dagster writes it
 
 @dataclass(frozen=True, eq=False)
 class Partitioning:
-    """One way of partitioning.
+    """A partitioning scheme.
 
-    dimensions: the keys of each dimension by its name, one or two, in the order of their names. columns: the values of
-    a table's partition columns for a key; wanted: a study's keys.
+    dimensions: the keys of each dimension by its name, one or two, sorted by name. columns: returns the values of a
+    table's partition columns for a key; wanted: returns a study's keys.
     """
 
     dimensions: Mapping[str, Sequence[str]]
@@ -30,21 +30,21 @@ class Partitioning:
 
     @cached_property
     def keys(self) -> Sequence[str]:
-        """Every key, in order."""
+        """All keys, in order."""
         return [*map(SEPARATOR.join, product(*self.dimensions.values()))]
 
     @cached_property
     def known(self) -> frozenset[str]:
-        """Every key, to look one up."""
+        """The set of all keys, for look-ups."""
         return frozenset(self.keys)
 
     @cached_property
     def key_of(self) -> Mapping[tuple[str, ...], str]:
-        """Every key by the values of its columns, as the path of a file has them."""
+        """Each key by the values of its columns, as in a file's path."""
         return {tuple(map(str, self.columns(key).values())): key for key in self.keys}
 
     def between(self, first: str, last: str) -> Sequence[str]:
-        """Return the keys of a range as Dagster has them: of two dimensions, the rectangle between its corners."""
+        """Return the keys of a range as Dagster defines it: in two dimensions, the rectangle between two corners."""
         spans = []
         for keys, start, end in zip(
             self.dimensions.values(), first.split(SEPARATOR), last.split(SEPARATOR), strict=True
@@ -54,16 +54,16 @@ class Partitioning:
 
 
 class KeyMapping(Protocol):
-    """Says which partitions of a parent one is made from."""
+    """Selects the upstream partitions of a partition."""
 
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """Return the parent's keys for a key of the stage below (None where that has no partitions)."""
+        """Return the parent's keys for a downstream key (None if that stage has no partitions)."""
         ...
 
 
 @dataclass(frozen=True)
 class Every:
-    """Every partition of the parent."""
+    """All partitions of the parent."""
 
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
         """See `KeyMapping`."""
@@ -84,7 +84,7 @@ EVERY, SAME = Every(), Same()
 
 @dataclass(frozen=True)
 class ByDimension:
-    """The partitions that agree in a dimension; one side has that dimension alone, the other has another besides."""
+    """The partitions that agree in one dimension; one side has only that dimension, the other has two."""
 
     name: str
 
@@ -99,7 +99,7 @@ class ByDimension:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Partitions that are stated one by one. below: what is made from each partition of the parent."""
+    """Partitions that are listed one by one. below: the downstream keys of each parent partition."""
 
     below: Mapping[str, Sequence[str]]
 

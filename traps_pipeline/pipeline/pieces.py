@@ -1,4 +1,4 @@
-"""Parts of an asset that are made again only when what they are made from changed.
+"""Cache the parts of an asset, and rebuild each only when its inputs change.
 
 The report is one page of a hundred tables, figures and pictures. Each is a piece: its content lies in an archive beside
 the asset's state, together with a digest of its inputs.
@@ -22,17 +22,17 @@ from traps_pipeline.base.paths import user_cache
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 
-NOTES = "inputs.json"  # of the archive: the digest of each piece's inputs
+NOTES = "inputs.json"  # archive member with the digest of each piece's inputs
 _DRAWN_BY = ("matplotlib", "pandas", "jinja2")  # libraries whose versions decide what a piece looks like
-_DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same pieces are the same bytes
+_DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give equal bytes
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset. reads: the stages and sources whose versions decide whether it is made again.
+    """One part of an asset. reads: the stages and sources whose versions decide whether it is rebuilt.
 
-    inputs: where not whole tables matter, the part that does, as JSON; it is compared instead of versions. is_shared:
-    whether every study has the same; it is then made once for a user.
+    inputs: if only part of a table matters, that part as JSON, which is compared instead of versions. is_shared:
+    whether all studies have the same; it is then built once per user.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Piece:
 def make_pieces(
     workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]
 ) -> tuple[dict[str, bytes], list[str]]:
-    """Return the content of all pieces by name, and the names of those whose inputs or code changed: made again."""
+    """Return the content of all pieces by name, and the names of those rebuilt because inputs or code changed."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
@@ -65,9 +65,9 @@ def make_pieces(
 
 
 class _Shared:
-    """An archive in the user's cache folder of the pieces that are the same in every study.
+    """An archive in the user's cache folder of the pieces that all studies share.
 
-    What cannot be read or written there is as if it were not there.
+    If it cannot be read or written, the pieces are built as if it did not exist.
     """
 
     def __init__(self, asset: str) -> None:
@@ -76,7 +76,7 @@ class _Shared:
         self._is_new = False
 
     def get(self, piece: Piece, inputs: str) -> bytes:
-        """Return the content of a piece, made if it is not there."""
+        """Return the content of a piece, built if it is not in the archive."""
         if self._pieces is None:
             self._pieces = {}
             with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
@@ -89,7 +89,7 @@ class _Shared:
         return content
 
     def keep(self) -> None:
-        """Store what was made."""
+        """Store the newly built pieces."""
         if self._pieces and self._is_new:
             inputs = {name: of for name, (of, _) in self._pieces.items()}
             contents = {name: content for name, (_, content) in self._pieces.items()}
@@ -110,7 +110,7 @@ def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:
 
 
 def _read(data: bytes) -> dict[str, tuple[str, bytes]]:
-    """Return the digest of the inputs and the content of each piece; none if the archive is damaged."""
+    """Return the input digest and content of each piece; empty if the archive is damaged."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             inputs = json.loads(archive.read(NOTES))

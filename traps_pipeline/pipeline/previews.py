@@ -1,6 +1,6 @@
-"""What a stage wants people to see of a partition beside its rows; `metadata` puts it into Dagster's words.
+"""Extra content that a stage shows of a partition beside its rows; `metadata` translates it for Dagster.
 
-A `StageOutput.shown` holds plain values, texts and these.
+A `StageOutput.shown` holds plain values, texts and these classes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from urllib.parse import quote
 if TYPE_CHECKING:
     import pandas as pd
 
-STUDY_URL = "/study"  # where `traps ui` serves the study's report, site and clips
+STUDY_URL = "/study"  # route of `traps ui` to the study's report, site and clips
 
 
 @dataclass(frozen=True)

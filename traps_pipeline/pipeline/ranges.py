@@ -1,6 +1,6 @@
-"""How the partitions of a group of stages are cut into ranges, one for each run.
+"""Cut the partitions of a group of stages into ranges, one per run.
 
-Of two dimensions a range is a rectangle of neighbours, as Dagster has them: a first and a last key.
+In two dimensions a range is a rectangle of neighbours, as Dagster defines it by a first and a last key.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from traps_pipeline.pipeline.partitioning import Partitioning
 
 Range = tuple[str | None, str | None]  # first and last key
 _Corners = tuple[int, int, int, int]  # first and last row, first and last column
-WORTH_S = 120.0  # of work that a run must find, since it costs 12 to 20 s before it does anything
+WORTH_S = 120.0  # minimum work per run, since each takes 12 to 20 s to start
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """The keys of a scheme as cells of two dimensions; those of one dimension stand in a single row."""
+    """The keys of a scheme as cells of two dimensions; a one-dimensional scheme is a single row."""
 
     rows: Sequence[str]
     columns: Sequence[str]
@@ -38,13 +38,13 @@ class _Grid:
             yield row_of[row], column_of[column]
 
     def range(self, top: int, bottom: int, left: int, right: int) -> Range:
-        """Return the range from one corner of a rectangle to the other; both belong to it."""
+        """Return the range between two corners of a rectangle, both inclusive."""
         first, last = (self.rows[top], self.columns[left]), (self.rows[bottom], self.columns[right])
         return "|".join(filter(None, first)), "|".join(filter(None, last))
 
 
 def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator[Range]:
-    """Yield as few ranges as there can be that together are exactly the keys."""
+    """Yield the fewest ranges that together contain exactly the keys."""
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
         return
@@ -72,10 +72,10 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
-    """Return so many ranges, or one a key where there are fewer, with about as many keys each and none twice.
+    """Return up to `most` ranges with about equally many keys each and no key twice, or one range per key.
 
-    A range may hold other keys. Cells of one model stay together where runs are fewer than models, since each run loads
-    its models anew; elsewhere those of one evaluation do.
+    A range may contain other keys. Cells of one model stay together if there are fewer runs than models, since each run
+    loads its models anew; otherwise cells of one evaluation do.
     """
     if scheme is None or not keys:
         return [(key, key) for key in keys]
@@ -91,8 +91,10 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
 def _parts(
     wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int, *, by_model: bool
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Yield rectangles (first and last row, first and last column) around the wanted cells of one whose first cell has
-    these numbers. heads: the model of each column of it; by_model: cut between models where there are enough."""
+    """Yield rectangles (first and last row, first and last column) around the wanted cells of one rectangle.
+
+    top, left: its first cell. heads: the model of each column; by_model: cut between models if there are enough.
+    """
     rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
     down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     wanted, heads, top, left = wanted[down, across], heads[across], top + int(rows[0]), left + int(columns[0])
@@ -116,8 +118,10 @@ def _parts(
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
-    """Return where lines of these sizes are cut in two, of some places, and how many of the parts go to the first half:
-    such that the parts are of one size, else at a place that is better, else in the middle."""
+    """Return where to cut lines of these sizes in two, and how many of the parts go to the first half.
+
+    Prefer parts of equal size, then a place in `better`, then the middle.
+    """
     total = int(sizes.sum())
     first = np.cumsum(sizes)[cuts - 1]
     shares = np.clip(np.rint(count * first / total), 1, count - 1).astype(int)
@@ -129,9 +133,9 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
 def shared_out(
     scheme: Partitioning | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
 ) -> list[Range]:
-    """Return ranges of runs that share the work of each key, so many (of `most`) that each finds enough to do.
+    """Return ranges of runs that share the work of each key, few enough (of `most`) to keep each run busy.
 
-    Up to the number of keys each run goes through all of them; else the runs of a range share one key.
+    Up to the number of keys, each run works through all of them; beyond that, the runs of a range share one key.
     """
     count = max(1, min(most, int(sum(seconds.values()) / WORTH_S)))
     if scheme is None or count <= len(keys):

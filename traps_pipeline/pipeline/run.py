@@ -1,4 +1,4 @@
-"""Walk the graph: make what is missing or stale, a Dagster run for each block of stages that share their partitions."""
+"""Walk the graph and materialize what is missing or stale, one Dagster run per block of stages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class WalkResult:
-    """Outcome of a pass: problems in sentences, failed checks among them; whether a budget ended it."""
+    """The result of a walk: problems in sentences, including failed checks; whether a budget ended it."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -40,11 +40,11 @@ class WalkResult:
 
 @contextmanager
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
-    """Open Dagster's history of this workspace, one process at a time: a first opening by two corrupts it.
+    """Open Dagster's history of this workspace, one process at a time: concurrent first openings corrupt it.
 
-    Runs whose process was killed are marked as failed: a queue would count them for ever. A history that is gone begins
-    anew, and so does one that is no history any more, which is kept beside it: what counts stands in the tables.
-    Raises TrapsError when the history cannot be read or written.
+    Runs whose process was killed are marked as failed, since a queue would count them forever. A lost history begins
+    anew, and so does an unreadable one, which is kept beside it: the tables are authoritative. Raises TrapsError if the
+    history cannot be read or written.
     """
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     require_history_path(home)
@@ -60,7 +60,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
                     instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
             yield instance
     except BrokenPipeError:
-        raise  # of what is printed to
+        raise  # the reader of the output has gone
     except Exception as error:
         cause = database_error(error)
         if isinstance(error, OSError):
@@ -86,9 +86,9 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         try:
             instance = _instance(home, is_captured=workspace.is_on_cluster)
             instance.get_runs_count()
-            instance.all_asset_keys()  # of the other file
+            instance.all_asset_keys()  # read the other file
         except OperationalError:
-            raise  # a full disk or another's lock: it is whole
+            raise  # a full disk or another process's lock: the history is intact
         except DatabaseError as error:
             if again or ("not a database" not in str(error) and "malformed" not in str(error)):
                 raise
@@ -104,7 +104,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
 
 def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
-    """Open a folder's instance. is_captured: steps print into Dagster's files, as runs on other hosts must."""
+    """Open a folder's instance. is_captured: write steps' output to Dagster's files, as runs on other hosts must."""
     if is_captured:
         return dg.DagsterInstance.from_config(str(home))
     silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
@@ -124,9 +124,9 @@ def _alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return a block's stages that have something to make, or stand below one that has, and the keys of these.
+    """Return a block's stages with work to do or downstream of such a stage, and the keys of these.
 
-    existing: only what is there already and outdated, and waits for nothing above it.
+    existing: only what exists, is outdated, and waits for nothing upstream.
     """
     pending: dict[str, list[str | None]] = {}
     for stage in block:
@@ -148,7 +148,10 @@ def materialize_stale(
     *,
     experiment: str | None = None,
 ) -> WalkResult:
-    """Make what is missing or stale of these stages, or of one experiment; KeyboardInterrupt passes through."""
+    """Materialize missing or stale partitions of these stages, or of one experiment.
+
+    KeyboardInterrupt propagates.
+    """
     outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
     history, partitions = History(instance, graph), StudyPartitions(workspace, experiment)
     tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})

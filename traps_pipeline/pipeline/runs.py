@@ -1,4 +1,4 @@
-"""How Dagster runs are made: here and now, one after another, or on the hosts of a cluster."""
+"""Execute Dagster runs: in this process, one after another, or on the hosts of a cluster."""
 
 from __future__ import annotations
 
@@ -23,34 +23,36 @@ from traps_pipeline.pipeline.translation import asset_key
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
 PARENT_TAG, ROOT_TAG = "dagster/parent_run_id", "dagster/root_run_id"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
-# Errors whose message is for people; the last one's class is imported where SQLite holds the history alone.
+# Errors whose message is for people; the last one's class is imported only if SQLite holds the history.
 _SENTENCES = (TrapsError.__name__, BudgetReached.__name__, "HistoryUnwritable")
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 
 @dataclass
-class Ran:
-    """What went wrong in a run, a sentence each, and whether a budget was reached."""
+class RunOutcome:
+    """A run's problems, one sentence each, and whether a budget was reached."""
 
     problems: list[str]
     over_budget: bool
 
 
 class Runs(ABC):
-    """Who makes runs of stages that share their partitions."""
+    """An executor of runs of stages that share their partitions."""
 
     @abstractmethod
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """Return the keys cut into ranges, one a run; runs may share one, and leave its other keys alone."""
+        """Return the keys cut into ranges, one per run; several runs may share a range, and each skips its unwanted
+        keys.
+        """
 
     @abstractmethod
-    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
-        """Make the stages in these ranges; KeyboardInterrupt passes through."""
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[RunOutcome]:
+        """Materialize the stages in these ranges; KeyboardInterrupt propagates."""
 
 
 class RunsHere(Runs):
-    """Runs in this process, of the job of all assets. parent: the run that starts them; log: is told of each."""
+    """Runs in this process, of the job of all assets. parent: the run that starts them; log: receives each."""
 
     def __init__(
         self,
@@ -66,10 +68,10 @@ class RunsHere(Runs):
         self.finished: list[dict[str, str]] = []
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """See `Runs`: as few as there can be of these keys alone."""
+        """See `Runs`: the fewest ranges that contain exactly these keys."""
         return [*batches(stages[0].scheme if stages else None, keys)]
 
-    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
         for number, one in enumerate(ranges, start=1):
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
@@ -81,7 +83,7 @@ class RunsHere(Runs):
             self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
             yield outcome
 
-    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> Ran:
+    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
         key = one[0] if one[0] == one[1] else None
         try:
             result = self._job.execute_in_process(
@@ -106,7 +108,7 @@ class RunsHere(Runs):
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
-    """Return the tags of a run of a range; a single key needs none, unless Dagster is told no other way (always)."""
+    """Return the tags of a range's run; a single key needs none unless `always`, for runs that get no key otherwise."""
     first, last = one
     if first is None or (first == last and not always):
         return {}
@@ -114,26 +116,26 @@ def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
 
 
 def range_of(tags: Mapping[str, str]) -> Range:
-    """Return the partitions of a run, by its tags: those of `range_tags`, or Dagster's own of a single key."""
+    """Return a run's partitions from its tags: those of `range_tags`, or Dagster's own of a single key."""
     single = tags.get("dagster/partition")
     return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
 
 
 def this_host() -> str:
-    """Return where process numbers mean what they mean here: the machine and its namespace of processes."""
+    """Return the scope of process ids: the machine and its namespace of processes."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 
 
-def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
-    """Return what failed steps say."""
+def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
+    """Return the messages of failed steps."""
     problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
     over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
-    return Ran(problems, over)
+    return RunOutcome(problems, over)
 
 
 def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
-    """Return whether a run or step ended for no reason that it could tell: host, network or database failed."""
+    """Return whether a run or step ended without stating a reason: host, network or database failed."""
     named = [{error.cls_name for error in _causes(event)} for event in failures]
     is_interrupted = any(names & {*_INTERRUPTS} for names in named)
     unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
@@ -154,7 +156,7 @@ def _chain(error: Any) -> list[Any]:
 
 
 def reason(error: Any) -> str:
-    """Return what an error of Dagster's says: our own sentence if it holds one, else its innermost cause."""
+    """Return the message of a Dagster error: our own sentence if it contains one, else its innermost cause."""
     chain = _chain(error)
     readable = [one for one in chain if one.cls_name in _SENTENCES]
     if not readable:

@@ -1,4 +1,4 @@
-"""The study's ways of partitioning: the keys are those of the study that `TRAPS_WORKSPACE` names."""
+"""The study's partitioning schemes, with the keys of the study that `TRAPS_WORKSPACE` names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def study_here() -> Workspace | None:
-    """Return the workspace that the environment names; None where there is none yet."""
+    """Return the workspace that the environment names; None if it does not exist yet."""
     place = Workspace.default_place()
     return Workspace.open(place) if Workspace.is_there(place) else None
 
@@ -19,7 +19,7 @@ def study_here() -> Workspace | None:
 _HERE = StudyPartitions(study_here())
 
 
-# Groups of assets that the study has no use for: Dagster does not show them, and nothing is made of them.
+# Groups of assets that the study does not use: Dagster does not show them, and nothing materializes them.
 LEFT_OUT = frozenset(
     group for group, used in (("mechanism", _HERE.looks_inside), ("arms", bool(_HERE.arms))) if not used
 )
@@ -60,11 +60,11 @@ by_steering = ByDimension("steering")
 
 
 def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], Iterable[str]]) -> Pairs:
-    """Return what partitions below are made from each above, of the keys that the study has."""
+    """Return the downstream keys of each upstream partition, limited to the study's keys."""
     pairs = {key: sorted(below.known & {*mapping(key)}) for key in sorted(above.known)}
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 
 
 def these_keys(above: Partitioning, keys: Iterable[str]) -> These:
-    """Return of all partitions above these, as far as the study has them."""
+    """Return the upstream partitions among these keys that the study has."""
     return These([key for key in keys if key in above.known])

@@ -1,6 +1,6 @@
-"""What a run is asked to make, and whether anything of it is to be made, from tables' footers alone.
+"""Decide what a run must materialize, if anything, from tables' footers alone.
 
-Nothing here imports Dagster or opens its history: `traps run` with nothing to do ends before it would.
+Nothing here imports Dagster or opens its history, so `traps run` with nothing to do ends before either.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
 
 _NOTE = "last_run.json"
-_HISTORY = Path("history", "runs", "index.db")  # of Dagster's SQLite storage, below its folder; holds every event
+_HISTORY = Path("history", "runs", "index.db")  # all events of Dagster's SQLite storage, below its folder
 
 
 def stages_until(until: str | None) -> set[str]:
-    """Return all stages; with `until`, these (commas between) and what they need. Raises TrapsError."""
+    """Return all stages, or those named by `until` (comma-separated) and their upstream. Raises TrapsError."""
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
@@ -35,7 +35,7 @@ def stages_until(until: str | None) -> set[str]:
 
 
 def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
-    """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
+    """Check that an experiment wants something of the named stages, or of any stage. Raises TrapsError."""
     partitions, graph = StudyPartitions(workspace, experiment), the_graph()
     if not partitions.cells and not partitions.states:
         raise TrapsError(
@@ -47,7 +47,7 @@ def require_work(workspace: Workspace, experiment: str, until: str | None) -> No
 
 
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
-    """Return checks of what is wanted that do not pass, whichever run made it."""
+    """Return failed checks of wanted partitions, from this or any earlier run."""
     partitions, problems = StudyPartitions(workspace, experiment), []
     for stage in the_graph().stages:
         for key in stage.wanted(partitions):
@@ -65,7 +65,7 @@ def _unquoted(details: str) -> str:
 
 
 def note_versions(workspace: Workspace, stages: Collection[str], experiment: str | None) -> None:
-    """Write down, after a run without problems, which versions Dagster's history holds, and what state it is in."""
+    """After a run without problems, record the versions in Dagster's history and the history's state."""
     if (history := _history_state(workspace)) is None:
         return
     lineage, partitions = Lineage(workspace), StudyPartitions(workspace, experiment)
@@ -76,14 +76,14 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
         for key in graph[name].wanted(partitions)
     }
     former = _read_note(workspace)
-    if former.get("history") == history:  # of other stages or another experiment: Dagster holds these too
+    if former.get("history") == history:  # keep versions of other stages or experiments
         versions = former["versions"] | versions
     note = json.dumps({"history": history, "versions": versions})
     workspace.store.write({workspace.dagster_home / _NOTE: note.encode()})
 
 
 def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: str | None) -> bool:
-    """Return whether every wanted partition is fresh and known to Dagster, whose history is as the last run left it."""
+    """Return whether every wanted partition is fresh and recorded, and the last run's history is unchanged."""
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
@@ -106,7 +106,7 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
-    """Return where Dagster's history lies, and size and time of its files; None where it is no file here."""
+    """Return the path of Dagster's history, and its files' sizes and times; None if it is not a local file."""
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     index = home / _HISTORY
     if workspace.is_shared or not index.is_file():

@@ -1,7 +1,7 @@
-"""The one declaration of a stage or source: what people edit, and what is made of it.
+"""Decorators that declare a stage or a source.
 
 `@stage(TABLE, ...)` declares that a function makes a table (or files for people), `@source(...)` that one returns the
-version of something that people edit. `pipeline.assets` makes Dagster's assets of them, `pipeline.step` their
+version of something that people edit. `pipeline.assets` builds Dagster's assets from them, `pipeline.step` their
 partitions.
 """
 
@@ -31,8 +31,8 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
-# Stages of these groups take seconds: their code version follows every file of these rooms. Others cost money or take
-# long, and state one that is raised by hand.
+# Stages of these groups take seconds, so their code version hashes every file of these rooms. Others cost money or
+# time, and state a version that is raised by hand.
 _FOLLOWED = {"report": ("protocol", "report")} | dict.fromkeys(
     ("scoring", "judging", "people"), ("protocol", "judging", "scoring", "people")
 )
@@ -40,26 +40,26 @@ _FOLLOWED = {"report": ("protocol", "report")} | dict.fromkeys(
 
 @cache
 def code_of(group: str) -> str:
-    """Return the code version of a group's stages that take no money and little time."""
+    """Return the code version of a group of cheap, fast stages."""
     paths = [path for room in _FOLLOWED.get(group, ()) for path in sorted((PACKAGE / room).rglob("*"))]
     files = [path for path in paths if path.is_file() and path.suffix != ".pyc"]
     return digest({path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in files})[:12] if files else "1"
 
 
 def is_declared(name: str) -> bool:
-    """Return whether a stage or source, declared before, is part of the study's graph."""
+    """Return whether a stage or source is declared and part of the study's graph."""
     return name in DECLARED
 
 
 def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: UpstreamPolicy = "every") -> Parent:
-    """Return a parent of a stage, by which of its partitions and how much of them it needs."""
+    """Return a stage's dependency on a parent: which of its partitions, and how many of them it needs."""
     return Parent(parent if isinstance(parent, str) else parent.name, mapping, need)
 
 
 def source(
     *, group: str, kinds: Sequence[str], scheme: Partitioning | None = None
 ) -> Callable[[Callable[[Workspace, Any], str]], Source]:
-    """Declare something that people edit, by the function of its name that returns its data version."""
+    """Declare a source by the function of its name, which returns its data version."""
 
     def declare(version: Callable[[Workspace, Any], str]) -> Source:
         one = Source(version.__name__, version, group, _doc(version), kinds, scheme)
@@ -85,7 +85,7 @@ def stage(
     shared: ConcurrentBuild | None = None,
     side_by_side: bool = False,
 ) -> Callable[[Callable[[Workspace, Any], Any]], Stage]:
-    """Declare what a function makes: a table, or files for people where only a name is given (see `graph.Stage`).
+    """Declare the function that makes a table, or files for people if only a name is given (see `graph.Stage`).
 
     The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
     It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.
@@ -124,7 +124,7 @@ def stage(
 
 
 def _with_preview(table: Table, rows: Any) -> StageOutput:
-    """Return the rows, a frame or values of the table's dataclass, as a frame whose first rows are shown."""
+    """Return the rows (a frame or values of the table's dataclass) as a frame, with a preview of the first."""
     import pandas as pd
 
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), columns=pd.Index(table.names))

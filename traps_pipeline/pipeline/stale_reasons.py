@@ -1,4 +1,4 @@
-"""`traps why`: which answers to an item are still valid, and which would be asked again."""
+"""Explain (`traps why`) which answers to an item are valid, and which would be asked again."""
 
 from __future__ import annotations
 
@@ -24,9 +24,11 @@ _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "ration
 
 
 def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
-    """Return an item's question and clip (if it is still in the benchmark), and for every evaluation that has asked it
-    whether its answer is still valid or which component of the key changed, with the answer and its votes. Raises
-    TrapsError for an unknown item."""
+    """Return an item's question and clip (if it is still in the benchmark), and the state of its answers.
+
+    For every evaluation that has asked it: whether its answer is valid or which component of the key changed, with the
+    answer and its votes. Raises TrapsError for an unknown item.
+    """
     dataset = item_id.split(":")[0]
     current = _current_item(workspace, dataset, item_id)
     explanation: dict[str, Any] = {"item": item_id, "evaluations": []}

@@ -1,9 +1,9 @@
-"""One stage in one Dagster run: which partitions are made, and which events tell Dagster of them.
+"""Run one stage in one Dagster run: build its partitions and report them to Dagster.
 
-`run_step` is the whole protocol, in the one order that is sound. What the inputs are is noted before anything is read.
-What cannot be made yet, or would be made from something damaged, is left with the reason. Each partition is written,
-read again, checked and told to Dagster as soon as it is done. The step then ends without an error, so that everything
-below it that can do without what is missing is made; the last step of a run raises for all of them (`checks`).
+`run_step` is the whole protocol, in the only sound order. It records the inputs' versions before it reads anything. It
+skips, with a reason, what cannot be built yet or would be built from something damaged. Each partition is written, read
+back, checked and reported to Dagster as soon as it is done. The step then ends without an error, so that everything
+downstream that does not need the missing partitions is built; the last step of a run raises for all of them (`checks`).
 
 A partition of a range gets an `AssetMaterialization` with a data version of its own, since the versions of a
 `MaterializeResult` hold for all partitions of a step (Dagster's issues 21072 and 34013). An asset without partitions
@@ -33,18 +33,18 @@ from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import StageOutput, State
 from traps_pipeline.storage.workspace import Workspace
 
-MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
-BACKFILL_TAG = "dagster/backfill"  # of a run of many: one that has nothing to make must not end them
+MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # tags of runs: what to build, for which experiment
+BACKFILL_TAG = "dagster/backfill"  # tag of a backfill's run: a run with nothing to do must not end the backfill
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
-TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: what this run did for it; that another run has made it
-RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another one goes on with
+TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: this run's work; whether another run built it
+RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process has resumed
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
 Events = Generator[Event, None, None]
-_ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
+_ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process started on it
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
-    """Make this run's part of a stage; yield Dagster's events. Raises TrapsError, at a run's end for all of it."""
+    """Build this run's part of a stage; yield Dagster's events. Raises TrapsError for all failures at the run's end."""
     step = _Step(stage, context, workspace)
     yield from step.tell_unwanted()
     for key in step.to_make():
@@ -69,7 +69,7 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
 
 
 class _Step:
-    """What `run_step` knows and does; its methods are called in the order in which they stand here."""
+    """The state and the phases of `run_step`; its methods are called in the order of their definition."""
 
     def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
         self.stage, self.context, self.workspace, self.graph = stage, context, workspace, the_graph()
@@ -83,13 +83,13 @@ class _Step:
         self.provenance = self.history.provenance(stage) if stage.scheme else {}
         self.checks = StageChecks(workspace, self.graph, stage)
         self._maker = PartitionMaker(workspace, stage, self.history)
-        self._inputs: dict[str | None, Mapping[str, str]] = {}  # of what is made, noted before anything is read
+        self._inputs: dict[str | None, Mapping[str, str]] = {}  # recorded before anything is read
         keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
         wanted_keys = {*stage.wanted(partitions)}
         self._wanted, self._unwanted = [k for k in keys if k in wanted_keys], [k for k in keys if k not in wanted_keys]
 
     def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
-        """Count cells that no experiment asks for, which a range may hold, as done, so that a backfill ends."""
+        """Report unwanted cells, which a range may contain, as done, so that a backfill ends."""
         if MAKE_TAG in self.tags:
             return
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
@@ -100,30 +100,30 @@ class _Step:
             yield self.history.event(self.stage, key, "not wanted", self.provenance, about)
 
     def to_make(self) -> list[str | None]:
-        """Return the keys of this run that are to be made: all that are wanted, or what its tag says of them."""
+        """Return this run's keys to build: all that are wanted, or those that its tag selects."""
         if MAKE_TAG not in self.tags:
             return self._wanted
         recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
         name, lineage = self.stage.name, self.lineage
         keys = [k for k in self._wanted if to_make(lineage, recorded, name, k, existing=existing)]
-        # What waits for something above it would be made twice.
+        # A partition that waits for an upstream one would be built twice.
         return [k for k in keys if not (existing and lineage.waits(name, k))]
 
     def admit(self, key: str | None) -> None:
-        """Note the inputs of a partition that can be made, or the reason why it cannot."""
+        """Record the inputs of a partition that can be built, or the reason why it cannot."""
         if reason := self.lineage.blocked(self.stage.name, key, current=MAKE_TAG in self.tags):
             self._maker.unmade[key] = TrapsError(reason)
         else:
             self._inputs[key] = self.lineage.inputs(self.stage.name, key)
 
     def make(self) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make what was admitted."""
+        """Build the admitted partitions."""
         if self._inputs:
             progress.current().stage(self.stage.name, len(self._inputs))
         return self._maker.make(self._inputs)
 
     def write(self, key: str | None, output: StageOutput) -> str:
-        """Write what was made; return its data version."""
+        """Write a stage's output; return its data version."""
         stage, inputs, content = self.stage, self._inputs[key], output.content
         if stage.table is not None:
             rows, failed = cast(Any, content), output.tally.errors
@@ -137,14 +137,14 @@ class _Step:
         return version
 
     def tell_taken(self) -> Iterator[dg.AssetMaterialization]:
-        """Tell of partitions that other runs have made."""
+        """Report partitions that other runs have built."""
         for key, (version, tally) in self._maker.taken.items():
             progress.current().partition(self.stage.name, key or "", tally)
             about = {TAKEN: "made by another run meanwhile", TALLY: json.dumps(vars(tally))}
             yield self.history.event(self.stage, key, version, self.provenance, about)
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
-        """Tell of partitions that could not be made, and of those that fail a check, in this run or before."""
+        """Report partitions that could not be built, and those that fail a check, in this run or before."""
         unmade = self._maker.unmade
         if unmade:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
@@ -153,26 +153,26 @@ class _Step:
         yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
-        """Hand on what an asset without partitions has made, or outputs for which Dagster writes no event of its own.
+        """Yield the result of an asset without partitions, or outputs for which Dagster writes no event of its own.
 
-        It skips what is below a step without outputs, and would write one event, with one version, for all partitions.
-        Observable sources, which tell their own versions too, carry this mark.
+        Dagster skips everything downstream of a step without outputs, and would write one event, with one version, for
+        all partitions. Observable sources, which report their own versions too, carry this mark.
         """
         for name in self.context.op_def.output_dict:
             if name != "result":
-                yield dg.Output(None, output_name=name)  # of a check
+                yield dg.Output(None, output_name=name)  # output of a check
         yield result or dg.MaterializeResult(metadata={SYSTEM_METADATA_KEY_SOURCE_ASSET_OBSERVATION: True})
 
     def stages_below(self) -> set[str]:
-        """Return the stages of this run that are made directly from this one."""
+        """Return the stages of this run that are directly downstream of this one."""
         selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
         return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
 
 
-def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Pass a step's events on, with progress in Dagster's log and without keys in the traceback that it stores.
+def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
+    """Forward a step's events, with progress in Dagster's log and without keys in the traceback that it stores.
 
-    A run that a signal stopped is canceled, which Dagster, as it did not stop it itself, would call a failure.
+    A run stopped by a signal is canceled; Dagster, which did not stop it itself, would call it a failure.
     """
     report = progress.current()
     try:
@@ -191,9 +191,9 @@ def guarded(events: Events, context: dg.AssetExecutionContext) -> Events:
 
 
 def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
-    """End this process if its run was resumed elsewhere since: its host was stopped and taken for dead.
+    """End this process if its run has been resumed elsewhere: its host was stopped and presumed dead.
 
-    Another process makes what it could not, and it must not tell Dagster that the run failed.
+    Another process builds what this one could not, so this one must not report a failed run to Dagster.
     """
     if instance.count_resume_run_attempts(run_id) > attempts:
         os._exit(RESUMED_ELSEWHERE)
@@ -202,8 +202,11 @@ def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> 
 def to_make(
     lineage: Lineage, recorded: Mapping[str | None, str | None], name: str, key: str | None, *, existing: bool = False
 ) -> bool:
-    """Return whether a partition is missing, stale, or unknown to Dagster: a crash between a table and its event leaves
-    such a table, which is made once more. existing: only what is there and made from what has changed since."""
+    """Return whether a partition is missing, stale, or unknown to Dagster.
+
+    A crash between a table and its event leaves a table that Dagster does not know, which is built once more. existing:
+    only partitions that exist and whose inputs have changed.
+    """
     status = lineage.status(name, key)
     if existing or status.kind == "missing":
         return bool(status.outdated) if existing else True

@@ -1,4 +1,4 @@
-"""`traps status`: the fresh, stale and missing partitions of a study, with the reasons."""
+"""Compute a study's fresh, stale and missing partitions, with the reasons (`traps status`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """The partitions of a stage: number of fresh, stale with reasons, missing; one of its own name if none."""
+    """The partitions of a stage: numbers of fresh, stale (with reasons) and missing ones.
+
+    A stage without partitions has one, of its own name.
+    """
 
     stage: str
     fresh: int
@@ -28,7 +31,7 @@ class StageStatus:
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """Yield the status of every stage, over the partitions that the study wants, or one of its experiments."""
+    """Yield the status of every stage, over the partitions that the study or one of its experiments wants."""
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}
@@ -38,7 +41,7 @@ def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | Non
 
 
 def failing_checks(workspace: Workspace) -> Iterator[tuple[str, str, str, str]]:
-    """Yield each check that does not pass: its name, stage, partition and what it says."""
+    """Yield each failed check: its name, stage, partition and message."""
     for file in workspace.store.below(workspace.root / "checks", "*/*/*.json"):
         stage, check = file.parts[-3:-1]
         yield check, stage, file.stem, workspace.store.here(file).read_text(encoding="utf-8")[:200]

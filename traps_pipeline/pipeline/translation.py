@@ -1,4 +1,4 @@
-"""The graph's words in Dagster's: asset keys, partitions, and which partitions of a parent one is made from."""
+"""Translate the graph into Dagster's asset keys, partitions and partition mappings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ for _category in (dg.BetaWarning, dg.PreviewWarning):
 
 
 def asset_key(name: str) -> dg.AssetKey:
-    """Return the asset key of a stage or source: its name, behind the study's where studies share one history."""
+    """Return the asset key of a stage or source: its name, after the study's if studies share one history."""
     return dg.AssetKey([*_prefix(), name])
 
 
@@ -28,7 +28,7 @@ def asset_key(name: str) -> dg.AssetKey:
 def _prefix() -> tuple[str, ...]:
     home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
     if workspace is not None and (workspace.is_shared or workspace.is_on_cluster):
-        return (workspace.study.name,)  # several studies share its database, and so may share its history
+        return (workspace.study.name,)  # several studies may share its database and its history
     if workspace is None or not home or Path(home).resolve() == workspace.dagster_home.resolve():
         return ()
     return (workspace.study.name,) if workspace.study.name else ()
@@ -36,13 +36,13 @@ def _prefix() -> tuple[str, ...]:
 
 @cache
 def partitions_of(scheme: Partitioning) -> dg.PartitionsDefinition:
-    """Return the partitions of a scheme, the same object for the same one."""
+    """Return Dagster's partitions of a scheme; the same object for the same scheme."""
     parts = {name: dg.StaticPartitionsDefinition([*keys]) for name, keys in scheme.dimensions.items()}
     return next(iter(parts.values())) if len(parts) == 1 else dg.MultiPartitionsDefinition(parts)
 
 
 def asset_deps(graph: Graph, name: str) -> list[dg.AssetDep]:
-    """Return what a stage is made from."""
+    """Return the Dagster dependencies of a stage."""
     deps = []
     for parent in graph.parents_of[name].values():
         is_partitioned = graph.declared[parent.name].scheme is not None

@@ -1,7 +1,7 @@
-"""Which partitions a study wants: what its experiments ask about the scenarios that it has.
+"""Compute which partitions a study wants: what its experiments ask about its scenarios.
 
-Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all read this one answer, so nothing
-asks a model that no experiment of the study names.
+Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
+model that no experiment of the study names.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 class StudyPartitions:
-    """The keys of every kind of partition that a study wants, in key order.
+    """The wanted keys of every kind of partition, in key order.
 
-    workspace: None for all that the registry has. experiment: one of the study's, whose part alone is wanted.
+    workspace: None for everything in the registry. experiment: limit the keys to this experiment of the study.
     """
 
     def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:
@@ -48,7 +48,7 @@ class StudyPartitions:
 
     @cached_property
     def categories(self) -> list[str]:
-        """Categories with scenarios, and those whose scenarios were all discarded since their table was made."""
+        """Categories with scenarios, and those whose scenarios were all discarded after their table was made."""
         if self._workspace is None:
             return [*CATEGORIES]
         existing = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
@@ -65,12 +65,12 @@ class StudyPartitions:
 
     @cached_property
     def arms(self) -> list[str]:
-        """Arms and variations among them."""
+        """The arms and variations among `datasets`."""
         return [dataset for dataset in self.datasets if dataset in BESIDE]
 
     @cached_property
     def asks_pairs(self) -> bool:
-        """Whether any of them is of pairs: arms alone have no leaderboard."""
+        """Whether any of `datasets` consists of pairs: arms alone have no leaderboard."""
         return bool({*self.datasets} & {*DATASETS})
 
     def _datasets(self, experiments: Iterable[Asked]) -> list[str]:
@@ -80,14 +80,14 @@ class StudyPartitions:
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:
-        """Every model under every regime in every run that is asked for, in the registry's order."""
+        """Every requested model, regime and run, in the registry's order."""
         named = {e for experiment in self._asked for e in _evaluations(experiment)}
         place = {model: number for number, model in enumerate(load_models())}
         return sorted(named, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
 
     @cached_property
     def cells(self) -> list[str]:
-        """Keys of the cells that are asked for."""
+        """Keys of the requested cells."""
         named = {
             Cell(dataset, evaluation).key
             for asked in self._asked
@@ -101,7 +101,7 @@ class StudyPartitions:
 
     @cached_property
     def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
-        """Datasets (no arms) and settings of what is asked inside models; None where nothing is."""
+        """Datasets (no arms) and settings of the mechanistic analyses; None if there are none."""
         if self._workspace is None:
             return [*DATASETS], None
         settings = self._workspace.study.mechanism
@@ -111,7 +111,7 @@ class StudyPartitions:
 
     @cached_property
     def looks_inside(self) -> bool:
-        """Whether anything is asked inside models."""
+        """Whether any mechanistic analysis is requested."""
         return self._inside is not None
 
     @cached_property
@@ -121,7 +121,7 @@ class StudyPartitions:
 
     @cached_property
     def patched_prompt(self) -> str | None:
-        """The VQA prompt under which activations are patched; None where none are."""
+        """The VQA prompt under which activations are patched; None without patching."""
         if self._inside is None:
             return None
         settings = self._inside[1]
@@ -131,7 +131,7 @@ class StudyPartitions:
 
     @cached_property
     def reads_sentences(self) -> bool:
-        """Whether the log-probability of abstentions is read."""
+        """Whether log-probabilities of abstentions are computed."""
         return self._inside is not None and (self._inside[1] is None or bool(self._inside[1].sentences))
 
     @cached_property
@@ -147,7 +147,7 @@ class StudyPartitions:
 
     @cached_property
     def extractions(self) -> list[Extraction]:
-        """Local models under the VQA prompts that are extracted."""
+        """Local models under the VQA prompts for which states are extracted."""
         if self._inside is None:
             return []
         settings = self._inside[1]
@@ -156,19 +156,19 @@ class StudyPartitions:
 
     @cached_property
     def states(self) -> list[str]:
-        """Keys of hidden_states: what is no dataset of pairs serves probes alone."""
+        """Keys of hidden_states; datasets that are no pairs serve only probes."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
         return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt == PROBE_PROMPT]
 
     @cached_property
     def probed_prompts(self) -> tuple[str, ...]:
-        """VQA prompts with whose states probes are fitted."""
+        """VQA prompts whose states probes are fitted on."""
         settings = self._inside[1] if self._inside else None
         return settings.probes.prompts if settings else (PROBE_PROMPT,)
 
     @cached_property
     def steered(self) -> list[str]:
-        """`model__directionregime__inferenceregime` of what is steered."""
+        """`model__directionregime__inferenceregime` of every steered evaluation."""
         if self._inside is None or not self.steers:
             return []
         settings = self._inside[1]
@@ -187,7 +187,7 @@ class StudyPartitions:
 
 
 def _evaluations(experiment: Asked) -> list[Evaluation]:
-    """Return those that a model has enough runs for; of no runs named, all that it has."""
+    """Return the experiment's evaluations for which a model has enough runs; all of its runs if none are named."""
     evaluations = []
     for model in experiment.models:
         available = range(1, get_model(model).runs + 1)

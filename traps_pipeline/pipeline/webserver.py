@@ -1,8 +1,8 @@
-"""Dagster's web server behind a guard (`webguard`), its daemon and the code server of both: `traps ui`.
+"""Run Dagster's web server behind a guard (`webguard`), with its daemon and their code server: `traps ui`.
 
-Dagster's own server takes any request that reaches its port: a page of another site, opened in the same browser, could
-launch runs, which spend money, and wipe history. `dagster dev` starts that server, and leaves processes behind where
-SIGINT is ignored; `serve_with_dagster` does without it.
+Dagster's own server accepts any request that reaches its port: a page of another site, opened in the same browser,
+could launch runs, which spend money, and wipe history. `dagster dev` starts that server, and leaves processes behind if
+SIGINT is ignored; `serve_with_dagster` avoids both.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ SERVED_FOLDERS = ("reports", "site", "clips")
 
 
 def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
-    """Run web server, daemon and their code server until KeyboardInterrupt, then end all that they started.
+    """Run web server, daemon and their code server until KeyboardInterrupt, then stop all their processes.
 
-    Raises TrapsError when one of them ends by itself.
+    Raises TrapsError if one of them ends by itself.
     """
     with tempfile.TemporaryDirectory() as folder:
         address, workspace = f"{folder}/code.sock", Path(folder) / "workspace.yaml"
@@ -65,13 +65,13 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
 
 
 def _start(module: str, *arguments: str, token: str | None = None) -> int:
-    """Return the process id of a module that is run as a program. token: for its environment."""
+    """Start a module as a program and return its process id. token: passed in its environment."""
     environment = _PATIENCE | os.environ | {"DAGSTER_IS_DEV_CLI": "1"} | ({TOKEN_VARIABLE: token} if token else {})
     return subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment).pid
 
 
 def _wait_for_socket(address: str, started: dict[int, str]) -> None:
-    """Return when the code server answers at its socket, or has ended."""
+    """Wait until the code server answers at its socket, or has ended."""
     while not os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
         with socket.socket(socket.AF_UNIX) as probe:
             if probe.connect_ex(address) == 0:
@@ -80,7 +80,7 @@ def _wait_for_socket(address: str, started: dict[int, str]) -> None:
 
 
 def study_route(workspace: Workspace) -> Route:
-    """Return a route to the study's report, site and clips, for the links that assets show."""
+    """Return a route to the study's report, site and clips, for the links in Dagster's pages."""
     from starlette.responses import FileResponse, PlainTextResponse, Response
     from starlette.routing import Route
 
@@ -110,7 +110,7 @@ def main() -> None:
         WorkspaceProcessContext(instance, workspace_load_target=WorkspaceFileTarget([workspace])) as context,
     ):
         app = create_app_from_workspace_process_context(context)
-        app.routes.insert(0, study_route(Workspace.open()))  # Dagster's own last route takes every path
+        app.routes.insert(0, study_route(Workspace.open()))  # Dagster's own last route matches every path
         address = f"[{host}]" if ":" in host else host
         print(f"\n  open http://{address}:{port}/?token={token}\n", file=sys.stderr, flush=True)
         uvicorn.run(

@@ -1,1 +1,1 @@
-"""The words and keys of the benchmark: datasets, arms, regimes, metrics and the cells that they span."""
+"""The vocabulary and keys of the benchmark: datasets, arms, regimes, metrics and the cells that they span."""

@@ -1,4 +1,4 @@
-"""Keys of cells, evaluations and extractions: how they are formatted, parsed and checked.
+"""Format, parse and check the keys of cells, evaluations and extractions.
 
 Dagster allows two partition dimensions, sorts them by name, and forbids `|`, `,`, `[` and `]` inside a key.
 """
@@ -26,12 +26,12 @@ class Evaluation:
 
     @property
     def key(self) -> str:
-        """`model__regime__runN`."""
+        """The partition key `model__regime__runN`."""
         return f"{self.model}__{self.regime}__run{self.run}"
 
     @staticmethod
     def parse(key: str) -> Evaluation:
-        """Return inverse of `key`. Raises ValueError naming what is wrong."""
+        """Return the evaluation of a key. Raises ValueError that says what is wrong."""
         match = _EVALUATION.fullmatch(key)
         if match is None or match["regime"] not in REGIMES:
             raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
@@ -52,13 +52,13 @@ class Cell:
 
     @property
     def partition(self) -> dict[str, Any]:
-        """Values of the tables' partition columns."""
+        """Values of the table's partition columns."""
         e = self.evaluation
         return {"dataset": self.dataset, "model": e.model, "regime": e.regime, "run": e.run}
 
     @staticmethod
     def parse(key: str) -> Cell:
-        """Return inverse of `key`. Raises ValueError."""
+        """Return the cell of a key. Raises ValueError that says what is wrong."""
         dataset, _, evaluation = key.partition("|")
         if dataset not in (*DATASETS, *BESIDE):
             raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *BESIDE)}")
@@ -77,17 +77,17 @@ class Extraction:
 
     @property
     def key(self) -> str:
-        """`model__prompt`."""
+        """The partition key `model__prompt`."""
         return f"{self.model}__{self.prompt}"
 
     @property
     def partition(self) -> dict[str, Any]:
-        """Values of the tables' partition columns."""
+        """Values of the table's partition columns."""
         return {"model": self.model, "prompt": self.prompt}
 
     @staticmethod
     def parse(key: str) -> Extraction:
-        """Return inverse of `key`. Raises ValueError naming what is wrong."""
+        """Return the extraction of a key. Raises ValueError that says what is wrong."""
         model, _, prompt = key.partition("__")
         if prompt not in VQA_PROMPTS:
             raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
@@ -108,12 +108,12 @@ class StatesCell:
 
     @property
     def partition(self) -> dict[str, Any]:
-        """Values of the tables' partition columns."""
+        """Values of the table's partition columns."""
         return {"dataset": self.dataset, **self.extraction.partition}
 
     @staticmethod
     def parse(key: str) -> StatesCell:
-        """Return inverse of `key`. Raises ValueError."""
+        """Return the cell of a key. Raises ValueError that says what is wrong."""
         dataset, _, extraction = key.partition("|")
         if dataset not in PROBED_DATASETS:
             raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {PROBED_DATASETS}")
@@ -121,12 +121,14 @@ class StatesCell:
 
 
 class SteeredEvaluation(Evaluation):
-    """A model that is steered while it answers under a regime. Its ledger holds all directions: what is not steered
-    (alpha 0) is one answer for all of them."""
+    """A model that is steered while it answers under a regime.
+
+    Its ledger holds all directions: an unsteered answer (alpha 0) is shared by all of them.
+    """
 
     @property
     def key(self) -> str:
-        """`model__regime__steered`: the ledger's folder."""
+        """The name of the ledger's folder: `model__regime__steered`."""
         return f"{self.model}__{self.regime}__steered"
 
 
@@ -138,7 +140,7 @@ class SteeringCell(Cell):
 
     @property
     def run(self) -> str:
-        """`model__directionregime__inferenceregime`."""
+        """The second key dimension: `model__directionregime__inferenceregime`."""
         return f"{self.evaluation.model}__{self.directions}__{self.evaluation.regime}"
 
     @property
@@ -148,21 +150,21 @@ class SteeringCell(Cell):
 
     @property
     def partition(self) -> dict[str, Any]:
-        """Values of the tables' partition columns."""
+        """Values of the table's partition columns."""
         e = self.evaluation
         return {"dataset": self.dataset, "model": e.model, "directions": self.directions, "regime": e.regime}
 
     @staticmethod
     def make(dataset: str, model: str, directions: str, regime: str) -> SteeringCell:
-        """Return the cell of these."""
+        """Return the steering cell of a dataset, a model, its directions' prompt and its answers' regime."""
         return SteeringCell(dataset, SteeredEvaluation(model, regime, 1), directions)
 
     @staticmethod
     def parse(key: str) -> SteeringCell:
-        """Return inverse of `key`. Raises ValueError."""
+        """Return the cell of a key. Raises ValueError that says what is wrong."""
         dataset, _, run = key.partition("|")
         parts = run.split("__")
-        # A graph has a key of each dataset of its study, arms too; only those of the pairs are ever wanted.
+        # The graph has a key for each dataset of its study, arms too; only those of pairs are ever wanted.
         if dataset not in (*DATASETS, *BESIDE) or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
             raise ValueError(
                 f"steering key {key!r} is not dataset|model__directions__regime with regimes of {VQA_PROMPTS}"

@@ -1,4 +1,4 @@
-"""Datasets, arms and variations: their names, their sides, and the categories that they draw on."""
+"""Datasets, arms and variations: their names, their sides, and their categories."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ OCCLUSION_CATEGORIES = (
 )
 CHAOTIC_CATEGORIES = ("pachinko_waterfall", "plinko", "seesaw_sorter", "tumbling_dice")
 CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
-# Domains beside the benchmark's: each has a benchmark of its own (`scene_specs/extensions/`), whose voids are made by a
-# panel, as those of occlusion are. No study of the benchmark has one, nor has any number of the paper.
+# Domains beside the benchmark's: each has its own benchmark (`scene_specs/extensions/`), whose voids use an
+# occluder, as those of occlusion do. No study of the main benchmark and no number of the paper includes one.
 EXTENSION_CATEGORIES = ("soft_bodies",)
 ALL_CATEGORIES = CATEGORIES + EXTENSION_CATEGORIES
 
 DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
 LONG = {short: dataset for dataset, short in SHORT.items()}
-# Datasets beside the pairs, each of which takes one shortcut away (docs/arms.md). No part of PECS; asked on request.
+# Datasets beside the pairs, each of which removes one shortcut (docs/arms.md). No part of PECS; run on request.
 CROSSED = "crossed"  # has controls and voids; all other arms have controls alone
 TWIN = "twin_control"
 INFERENCE_ARMS = ("late_panel", "predictable_cut")  # the outcome is not shown, but can be inferred
 ROBUST_ARMS = ("decoy", "removed", "length_matched", TWIN, CROSSED)
 ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
-# Controls cut where their futures leave one answer as likely as is stated (docs/arms.md, "Graded cuts"). In no figure
-# of pairs or arms; asked on request.
+# Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no figure
+# of pairs or arms; run on request.
 GRADED = "graded"
-# Datasets that change one thing of the pairs, step by step, for what the paper supposes and did not measure
-# (docs/hypotheses.md). No part of PECS or of the arms' figures; asked on request.
+# Datasets that change one property of the pairs, step by step, to test the paper's untested assumptions
+# (docs/hypotheses.md). No part of PECS or of the arms' figures; run on request.
 LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
 PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_large")  # still voids
 PANEL_DOSES = ("panel_alpha_50",)  # the panel lets the outcome through: no voids
@@ -44,8 +44,8 @@ _ONE_TAXONOMY = {
     **dict.fromkeys(("decoy", "removed", "late_panel", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
     **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
 }
-ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
-TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each side's frames with the other's times
+ANSWERABLE = "occlusion_answerable"  # only in mechanistic stages: occlusion's voids, answerable
+TIME_SWAPPED = "chaotic_time_swapped"  # only in mechanistic stages: frames with the other side's times
 PROBED_ARMS = ("decoy", "removed", "length_matched")  # arms that probes are applied to where an experiment asks them
 PROBED_DATASETS = (*DATASETS, ANSWERABLE, TIME_SWAPPED, *PROBED_ARMS)
 SIDES = ("control", "void")
@@ -62,7 +62,9 @@ def is_ill_posed(dataset: str) -> bool:
 
 
 def transfer_type(source: str, target: str) -> str:
-    """Return what a path between datasets crosses (docs/spec.md 7.2): modality of the void, domain, both or neither."""
+    """Return what a transfer between datasets crosses (docs/spec.md 7.2): the void's modality, the domain, both or
+    neither.
+    """
     domain = taxonomy_of(source) != taxonomy_of(target)
     modality = is_ill_posed(source) != is_ill_posed(target)
     return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
@@ -92,12 +94,12 @@ def beside_of(taxonomy: str) -> tuple[str, ...]:
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:
-    """Return everything that a category's scenarios are asked in."""
+    """Return all datasets, arms and variations that a category's scenarios may be asked in."""
     return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
 
 
 def dataset_of(item_id: str) -> str:
-    """Return the dataset of an item, by its id `dataset:scenario:side`."""
+    """Return the dataset of an item from its id `dataset:scenario:side`."""
     return item_id.partition(":")[0]
 
 

@@ -1,6 +1,6 @@
-"""Metrics as words: what each is, how it is headed, its range, its direction and the items that it counts.
+"""Metrics in words: name, heading, range, direction, and the items that each counts.
 
-How they are computed is in `scoring.metrics`, how they are resampled in `scoring.bootstrap`.
+`scoring.metrics` computes them, `scoring.bootstrap` resamples them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of a model. side: of the items that a share counts; empty where it counts both."""
+    """A figure of a model. side: the side whose items a share counts; empty if it counts both."""
 
     name: str
     heading: str
@@ -22,7 +22,7 @@ class Metric:
 
     @property
     def is_share(self) -> bool:
-        """Whether it is the share of the items of one side, which is printed in percent."""
+        """Whether it is a share of the items of one side, printed in percent."""
         return bool(self.side)
 
 

@@ -1,6 +1,6 @@
-"""Votes of judges as a matrix with one row per answer and task and one column per judge, and their majority.
+"""Votes of judges as a matrix (one row per answer and task, one column per judge), and their majority.
 
-Verdicts, agreement, bias and scores without one judge are all made from this matrix.
+Verdicts, agreement, bias and scores without one judge are all computed from this matrix.
 """
 
 from __future__ import annotations
@@ -19,16 +19,18 @@ PANEL = "panel"  # stands for all judges together in a column that names a judge
 ANSWER = ["dataset", "model", "regime", "run", "item_id"]
 ABSTENTION, CORRECTNESS = ("void_abstention", "control_abstention"), ("correctness",)
 TASKS = (*ABSTENTION, *CORRECTNESS)
-# What the judges of a confabulation decide about a void failure (docs/spec.md 6.2).
+# The axes on which a judge labels a void failure (docs/spec.md 6.2).
 AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
 VOTE_COLUMNS = [*ANSWER, "side", "task", "judge", "valid", "abstained", "correct", "epoch", "benchmark_version"]
 
 
 @dataclass(frozen=True)
 class Ratings:
-    """The matrix of votes. answers: one row per answer and task, with the columns `answer` (which identify an answer),
-    task (one of TASKS), epoch and benchmark_version. values: (rows, judges) int8 of YES, NO and INVALID, columns in the
-    order of `judges`."""
+    """The matrix of votes.
+
+    answers: one row per answer and task, with the columns `answer` (which identify an answer), task (one of TASKS),
+    epoch and benchmark_version. values: (rows, judges) int8 of YES, NO and INVALID, columns in the order of `judges`.
+    """
 
     answers: pd.DataFrame
     values: np.ndarray
@@ -36,12 +38,15 @@ class Ratings:
     answer: Sequence[str]
 
     def select(self, chosen: np.ndarray) -> Ratings:
-        """Return the rows that a boolean mask chooses."""
+        """Return the rows that a boolean mask selects."""
         return replace(self, answers=self.answers.loc[chosen].reset_index(drop=True), values=self.values[chosen])
 
     def on(self, items: pd.DataFrame, tasks: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the votes on each item (rows with the columns `answer`) in that one of the tasks in which it was
-        judged: values, (items, judges), all INVALID if it was not judged; and whether it was judged, (items,)."""
+        """Return the votes on items, each on the one of `tasks` in which it was judged.
+
+        items: rows with the columns `answer`. Two arrays: values, (items, judges), all INVALID for an item that was not
+        judged; and whether it was judged, (items,).
+        """
         by = [*self.answer]
         judged = self.answers.loc[self.answers["task"].isin(tasks), by]
         merged = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
@@ -53,10 +58,10 @@ class Ratings:
 
 
 def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Sequence[str] = ANSWER) -> Ratings:
-    """Return the matrix of VOTES rows (with `VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical
-    order), or of rows of another table of votes, in which the columns `answer` identify an answer.
+    """Return the matrix of VOTES rows (with `VOTE_COLUMNS` at least) of these judges.
 
-    An answer that was not put to all of these judges is left out: another panel judged it.
+    judges: default all, in alphabetical order. Rows of another table of votes work too, if the columns `answer`
+    identify an answer. An answer without a vote of each of these judges is left out: another panel judged it.
     """
     import pandas as pd
 
@@ -75,9 +80,7 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of each vote's group by these columns, (votes,), and the first vote of each group,
-    (groups,).
-    """
+    """Return each vote's group number by these columns, (votes,), and the first vote of each group, (groups,)."""
     import pandas as pd
 
     code = np.zeros(len(votes), np.int64)
@@ -96,8 +99,7 @@ def _decisions(votes: pd.DataFrame) -> np.ndarray:
 
 
 def majority(values: np.ndarray) -> np.ndarray:
-    """Return the vote of more than half of the judges, (rows,) int8; INVALID where neither yes nor no has that many
-    votes."""
+    """Return the vote of more than half of the judges, (rows,) int8; INVALID without such a majority."""
     half = values.shape[1] / 2
     yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
     return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)

@@ -1,4 +1,4 @@
-"""Regimes: the system prompts under which models answer, each with its texts and the form of its answers."""
+"""Regimes: the system prompts under which models answer, with their texts and answer formats."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Regime:
-    """A way of asking. Its texts are files of `assets/prompts`, joined by one blank line.
+    """A system prompt and its answer format. Its texts are files of `assets/prompts`, joined by one blank line.
 
     fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
     read (docs/spec.md 7.1); none: no states are read under this regime. marker: of a model's point in the landscape.
-    first_token: whether the log-probabilities of the answer's first token are kept and scored.
+    first_token: whether the log-probabilities of the answer's first token are stored and scored.
     """
 
     name: str
@@ -40,7 +40,7 @@ BY_NAME: Mapping[str, Regime] = {
         Regime("logprobs", ("vqa_standard", "logprobs_suffix"), first_token=True),
     )
 }
-# The fields of the object that an answer must be, by what asks for it; any other answer is free text.
+# The fields of a JSON answer, by the regime or dataset that asks for it; any other answer is free text.
 FIELDS: Mapping[str, tuple[str, ...]] = {
     **{name: regime.fields for name, regime in BY_NAME.items() if regime.fields},
     "schema_answer": ("final_answer",),
@@ -51,7 +51,7 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
 WRONG_COSTS = 3
 ANSWER_FROM = WRONG_COSTS / (1 + WRONG_COSTS)  # the probability of being right from which an answer is worth its risk
 REGIMES = tuple(BY_NAME)
-PAPER_REGIMES = ("standard", "guided", "json")  # what the paper asks, and an experiment that names no regimes
+PAPER_REGIMES = ("standard", "guided", "json")  # the paper's, and the default of an experiment
 VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)
 # The paper compares answers under these two: the plain prompt, and the one that permits an abstention.
 STANDARD, GUIDED = PROMPTING = ("standard", "guided")
@@ -59,8 +59,7 @@ PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves d
 
 
 def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
-    """Return the fields of the object that an answer must be under a regime, in a dataset that may vary it; None for
-    free text."""
+    """Return the fields of the JSON answer under a regime, in a dataset that may vary it; None for free text."""
     return FIELDS.get(dataset, FIELDS.get(regime))
 
 

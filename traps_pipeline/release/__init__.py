@@ -1,1 +1,1 @@
-"""What others install, load, cite, run elsewhere and hold us to: the released folder, commitments, submissions."""
+"""Publication: the released folder, commitments, harnesses, results files and submissions."""

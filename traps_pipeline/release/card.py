@@ -1,4 +1,4 @@
-"""The dataset card with the hub's header, and the data dictionary, both from the definitions of the tables."""
+"""Write the dataset card (with the hub's header) and the data dictionary, both from the tables' definitions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from traps_pipeline.release.released_rows import HELD_OUT_ITEMS, PAIRS, RELEASED_ITEMS
 from traps_pipeline.storage.tables import Table
 
-# Tables whose rows have clips. The hub's loader reads all configurations of a folder with one builder, that of videos;
+# Tables whose rows have clips. The hub's loader reads all configurations of a folder with one builder, for videos;
 # the other tables are read with its builder for JSON.
 _WITH_CLIPS = (PAIRS.name, RELEASED_ITEMS.name, HELD_OUT_ITEMS.name)
 
 
 @cache
 def environment() -> Environment:
-    """Return the templates of a release: plain text, of which an undefined name is an error."""
+    """Return the template environment of a release: plain text, in which an undefined name is an error."""
     folder = Path(__file__).parent / "templates"
     return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, keep_trailing_newline=True)
 

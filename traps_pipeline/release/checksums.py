@@ -1,4 +1,4 @@
-"""The SHA-256 of every file of a folder, in the form that `sha256sum --check` reads."""
+"""Write and verify the SHA-256 of every file of a folder, in the format of `sha256sum --check`."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from traps_pipeline.base.files import write_text
 
 CHECKSUMS = "SHA256SUMS"
 SIGNATURE = "signature.sig.json"
-_OUTSIDE = (CHECKSUMS, SIGNATURE)  # what cannot hold its own checksum, and what is signed over it
+_OUTSIDE = (CHECKSUMS, SIGNATURE)  # the checksum file itself, and the signature over it
 _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
 def released_files(folder: Path) -> list[str]:
-    """Return every file of a folder that has a checksum, by its path in it, in order; hidden files have none."""
+    """Return every file of a folder that has a checksum, by relative path, sorted; hidden files have none."""
     paths = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
     names = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
     return sorted(name for name in names if name not in _OUTSIDE)
 
 
 def write_checksums(folder: Path, canary: str) -> int:
-    """Write the checksums of a folder, below a comment with the canary; returns the number of files."""
+    """Write the checksums of a folder, below a comment with the canary; return the number of files."""
     names = released_files(folder)
     lines = [f"{file_digest(folder / name)}  {name}\n" for name in names]
     write_text(folder / CHECKSUMS, f"# {canary}\n{''.join(lines)}")
@@ -31,7 +31,7 @@ def write_checksums(folder: Path, canary: str) -> int:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return the checksum of each file by its path. Raises TrapsError naming the line that is none."""
+    """Return the checksum of each file by its path. Raises TrapsError naming an invalid line."""
     path = folder / CHECKSUMS
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -51,7 +51,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def altered_files(folder: Path) -> list[str]:
-    """Return what differs between a folder and its checksums, a sentence for each file. Raises TrapsError."""
+    """Return the differences between a folder and its checksums, one sentence per file. Raises TrapsError."""
     expected, existing = read_checksums(folder), {*released_files(folder)}
     problems = []
     for name in sorted({*expected, *existing}):

@@ -1,7 +1,7 @@
-"""Commit and reveal: a benchmark is fixed before anybody sees it, and later proven to be the one that was fixed.
+"""Commit and reveal: fix a benchmark before anybody sees it, and later prove that it is the same one.
 
-The commitment holds a digest of the seed and one of each record, all mixed with a secret number, so that nobody can try
-seeds until one fits. The reveal holds the seed and that number. Whoever has both draws the benchmark again.
+The commitment holds digests of the seed and of each record, all mixed with a secret number, so that nobody can search
+for the seed. The reveal holds the seed and that number. Anyone with both can draw the benchmark again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 _HEX = r"^[0-9a-f]{64}$"
-# What a record says of arithmetic: another CPU or another version of the simulator may draw the same scene otherwise.
+# Fields of a record that depend on arithmetic: another CPU or simulator version may draw the same scene differently.
 _OF_ARITHMETIC = ("evidence", "trajectory_sha256", "twin", "control")
 _LIBRARIES = ("mujoco", "numpy")
 
@@ -38,9 +38,11 @@ class _Strict(BaseModel):
 
 
 class Commitment(_Strict):
-    """What is published first. draws: scenarios by family. look: the parts of the look that were drawn, by family.
-    seed: digest of the seed. specs: digest of each record. made_with: machine and libraries, on which the arithmetic
-    of a draw depends."""
+    """The public file.
+
+    draws: scenarios by family. look: the varied parts of the look, by family. seed: digest of the seed. specs: digest
+    of each record. made_with: machine and libraries, which may affect the arithmetic of a draw.
+    """
 
     format: Literal[1] = 1
     name: str
@@ -54,7 +56,7 @@ class Commitment(_Strict):
 
 
 class Reveal(_Strict):
-    """What is kept secret until the benchmark is revealed. nonce: the secret number, in hexadecimal digits."""
+    """The secret file, kept until the benchmark is revealed. nonce: the secret number, in hexadecimal digits."""
 
     format: Literal[1] = 1
     seed: int = Field(ge=0)
@@ -70,8 +72,11 @@ def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
 
 
 def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
-    """Commit to a benchmark of `traps benchmark sample`: write what is public and what is kept (readable by its owner
-    alone). Raises TrapsError where the folder is none, or of several seeds, and where either file is there already."""
+    """Commit to a benchmark of `traps benchmark sample`: write the public file and the secret one.
+
+    Only the owner can read the latter. Raises TrapsError if the folder is no such benchmark, or of several seeds, and
+    if either file exists.
+    """
     for path in (commitment, reveal):
         if path.exists():
             raise TrapsError(f"{path}: is there already, and a commitment is made once; name another file")
@@ -126,7 +131,7 @@ def _read(kind: type[Any], path: Path) -> Any:
 
 
 def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
-    """Return the records of a sampled or released folder. Raises TrapsError, also for another trajectory."""
+    """Return the records of a sampled or released folder. Raises TrapsError, also for an altered trajectory."""
     from traps_pipeline.benchmark.specs import spec_of
 
     if (folder / "scenarios.jsonl").is_file():
@@ -150,7 +155,7 @@ def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
 
 
 def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
-    """Return how records differ from those that were committed, a sentence each; the first says so of the seed."""
+    """Return the differences between records and commitment, one sentence each, the seed's first."""
     problems = []
     if _sealed_seed(reveal, commitment.draws) != commitment.seed:
         problems.append("the revealed seed, number or composition is not the one that was committed")
@@ -171,7 +176,10 @@ def drawn_again(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> dict[str, SceneSpec]:
-    """Return the records that the revealed seed gives here. Raises TrapsError where a family cannot be filled."""
+    """Return the records that the revealed seed gives on this machine.
+
+    Raises TrapsError if a family cannot be filled.
+    """
     with TemporaryDirectory(prefix="traps-") as folder:
         with kept_workers():
             for family, count in commitment.draws.items():
@@ -193,13 +201,13 @@ def drawn_again(
         return load_released(Path(folder) / "released")
 
 
-def same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
-    """Return whether two records differ in nothing but what depends on a machine's arithmetic."""
+def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
+    """Return whether two records differ only in fields that depend on a machine's arithmetic."""
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 
 
 def other_arithmetic(commitment: Commitment) -> str:
-    """Return how machine and libraries differ from those of the commitment, in words; empty where they do not."""
+    """Return how machine and libraries differ from the commitment's, in words; empty if they do not."""
     here = _made_with()
     names = [name for name in here if commitment.made_with.get(name) != here[name]]
     return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)

@@ -1,4 +1,4 @@
-"""The rows of a released folder, from the tables of a study whose clips are rendered."""
+"""Build the rows of a released folder from the tables of a study with rendered clips."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Content:
-    """What is released: ITEMS rows of pairs and arms; SCENE_SPECS rows; clips by path in the folder; the benchmark."""
+    """The released content: ITEMS rows of pairs and arms; SCENE_SPECS rows; clips by released path; the benchmark."""
 
     items: Rows
     specs: Rows
@@ -59,7 +59,7 @@ class Content:
 
 
 def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
-    """Return a study's pairs, and items of these arms. Raises TrapsError for what is not made, or a wrong clip."""
+    """Return a study's pairs, and items of these arms. Raises TrapsError for missing tables, or a wrong clip."""
     items = _records(workspace, ITEMS, (*DATASETS, *arms))
     if not items:
         raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")
@@ -96,7 +96,7 @@ def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
 
 
 def pair_rows(content: Content) -> list[PairRow]:
-    """Return a row a pair, in the order of their ids. Raises TrapsError for a pair of which a side is missing."""
+    """Return one row per pair, sorted by id. Raises TrapsError for a pair with a missing side."""
     lite, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
     for row in content.items:
         if row["dataset"] in DATASETS:
@@ -124,7 +124,7 @@ def pair_rows(content: Content) -> list[PairRow]:
 
 
 def item_rows(content: Content) -> list[ReleasedItemRow]:
-    """Return a row an item, in the order of their ids."""
+    """Return one row per item, sorted by id."""
     lite = lite_of(content.items)
     return [
         ReleasedItemRow(
@@ -138,7 +138,7 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
-    """Return a row an item, without what tells its answer, in the order of names that tell nothing."""
+    """Return one row per item, without any field that reveals its answer, sorted by opaque name."""
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
@@ -153,17 +153,17 @@ def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
 
 
 def held_out_clip(media_digest: str) -> str:
-    """Return path of a clip in a folder without answers: its name is its content."""
+    """Return a clip's path in a folder without answers: its name is the digest of its content."""
     return f"{_CLIPS}{media_digest[:2]}/{media_digest[:32]}.mp4"
 
 
 def scenario_rows(content: Content) -> list[ScenarioRow]:
-    """Return a row a scenario: its whole record."""
+    """Return one row per scenario: its complete record."""
     return [ScenarioRow(**row, canary=content.release.canary) for row in content.specs]
 
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
-    """Return a row for each certificate of each scenario, judged by the numbers that its record stores."""
+    """Return one row per certificate and scenario, evaluated on the numbers that its record stores."""
     return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content.release.canary)]
 
 
@@ -190,7 +190,7 @@ def _certificates(spec: SceneSpec, canary: str) -> Iterable[CertificateRow]:
 
 
 def split_rows(content: Content) -> list[SplitRow]:
-    """Return a row for each scenario of each split."""
+    """Return one row per scenario and split."""
     splits = {"lite": lite_of(content.items), "test": _ids(content.items)}
     return [
         SplitRow(split=name, scenario_id=id_, canary=content.release.canary)
@@ -200,7 +200,7 @@ def split_rows(content: Content) -> list[SplitRow]:
 
 
 def prompt_rows(canary: str) -> list[PromptRow]:
-    """Return a row for the system prompt of each regime, and for each of the panel's tasks."""
+    """Return one row per system prompt: of each regime, and of each task of the panel."""
     texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
     texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
     texts |= {(SYSTEM, regime): system_prompt(regime) for regime in PAPER_REGIMES}

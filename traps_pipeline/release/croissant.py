@@ -69,7 +69,7 @@ _RAI: Mapping[str, Any] = {
 
 
 def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
-    """Return the description as JSON-LD. root: the folder, whose tables are already there."""
+    """Return the description as JSON-LD. root: the folder, which already holds the tables."""
     described: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

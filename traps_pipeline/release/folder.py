@@ -1,4 +1,4 @@
-"""`traps publish release`: the folder that is published, the same bytes whenever it is made from the same study."""
+"""Write the released folder (`traps publish release`): the same bytes for the same study."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from traps_pipeline.release.released_rows import (
 )
 from traps_pipeline.storage.tables import Table
 
-FORMAT = 1  # of a released folder
+FORMAT = 1  # version of the released folder's format
 MANIFEST, COMMITMENT, CROISSANT = "release.json", "commitment.json", "croissant.json"
 CARD, DICTIONARY, CITATION = "README.md", "DICTIONARY.md", "CITATION.cff"
 LICENCE, PROMPTS_LICENCE = "LICENSE-DATA", "LICENSE-PROMPTS"
-# The hub's loader finds clips below the folder of their table alone: pairs name theirs from the top, items from clips/.
+# The hub's loader finds clips only below their table's folder: pairs name them from the top, items from clips/.
 PLACES: Mapping[str, str] = {
     PAIRS.name: "metadata.jsonl",
     RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
@@ -50,9 +50,12 @@ PLACES: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Options:
-    """How a folder is released. arms: beside the pairs. held_out: the file of the key under which items get opaque
-    names, and beside which their answers are written; None to publish the answers. date: of the publication,
-    YYYY-MM-DD. commitment: a file that `traps benchmark commit` wrote."""
+    """Options of a release.
+
+    arms: published beside the pairs. held_out: the file of the key that gives items opaque names, beside which their
+    answers are written; None to publish the answers. date: of the publication, YYYY-MM-DD. commitment: a file of `traps
+    benchmark commit`.
+    """
 
     arms: Sequence[str] = ()
     anonymous: bool = False
@@ -62,8 +65,8 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Released:
-    """What was written: numbers of files, clips and rows by table; where the answers of a held-out set lie."""
+class ReleaseSummary:
+    """A summary of the written folder: numbers of files, clips and rows by table; the path of held-out answers."""
 
     files: int
     clips: int
@@ -73,7 +76,7 @@ class Released:
 
 @dataclass
 class _Folder:
-    """A folder that is being written, with what must not be told in it."""
+    """The folder in progress, and the texts that must not appear in it."""
 
     root: Path
     hide: Callable[[str], str]
@@ -88,13 +91,13 @@ class _Folder:
         self.rows[table.name] = len(rows)
 
 
-def write_release(content: Content, target: Path, options: Options) -> Released:
-    """Write the folder; nothing but a former release may lie there. Raises TrapsError."""
+def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
+    """Write the folder; it may replace only a former release. Raises TrapsError."""
     if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
         raise TrapsError(
             f"{target}: holds other files, or what a stopped release left; give an empty or a new folder, or delete it"
         )
-    if options.held_out is not None and options.held_out.is_relative_to(target):  # before a former release is removed
+    if options.held_out is not None and options.held_out.is_relative_to(target):  # before removing a former release
         raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
     _clear(target)
     folder = _Folder(target, anonymous if options.anonymous else str)
@@ -110,11 +113,11 @@ def write_release(content: Content, target: Path, options: Options) -> Released:
         write_bytes(target / name, source.read_bytes())
     _pages(folder, content, options)
     files = write_checksums(target, content.release.canary) + 1
-    return Released(files, len(clips), folder.rows, answers)
+    return ReleaseSummary(files, len(clips), folder.rows, answers)
 
 
 def _clear(target: Path) -> None:
-    """Remove a former release, of which each file is named in its checksums, so that nothing of it stays."""
+    """Remove all files of a former release, as its checksums name them."""
     from traps_pipeline.release.checksums import read_checksums, released_files
 
     if not (target / CHECKSUMS).is_file():
@@ -135,7 +138,7 @@ def _open_tables(folder: _Folder, content: Content) -> None:
 
 
 def _held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
-    """Write the items without their answers, and beside the key which item each of them is."""
+    """Write the items without their answers, and the answers beside the key."""
     key = held_out_key(key_file, make=True)
     folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(content, key))
     names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in content.items)
@@ -173,7 +176,7 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
 
 
 def _about(content: Content) -> dict[str, Any]:
-    """Return name, version and canary of what is released, and the version of each dataset."""
+    """Return name, version and canary of the release, and the version of each dataset."""
     return {**content.release.model_dump(), "versions": content.versions}
 
 
@@ -189,7 +192,7 @@ ANONYMOUS_CITATION = {
 
 
 def identifying() -> dict[str, str]:
-    """Return what tells who made the benchmark, and what stands in its place for double-blind review."""
+    """Return the texts that identify the authors, each with its replacement for double-blind review."""
     data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
     names = [f"{one['given-names']} {one['family-names']}" for one in paper["authors"]]
@@ -199,7 +202,7 @@ def identifying() -> dict[str, str]:
 
 
 def anonymous(text: str) -> str:
-    """Return a text without what tells who made the benchmark, wherever lines are broken."""
+    """Return a text without the authors' identity, even across line breaks."""
     for words, instead in identifying().items():
         text = re.sub(r"\s+".join(map(re.escape, words.split())), instead, text)
     return text

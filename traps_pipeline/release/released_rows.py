@@ -1,4 +1,4 @@
-"""The tables of a released folder. The data dictionary, the card and the Croissant description are made from these."""
+"""The tables of a released folder, from which the data dictionary, the card and the Croissant description are made."""
 
 from dataclasses import dataclass
 from typing import Annotated

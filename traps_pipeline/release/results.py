@@ -1,4 +1,4 @@
-"""A study's leaderboard in the forms that others collect: the hub's `.eval_results`, Every Eval Ever, plain Parquet."""
+"""Export a study's leaderboard: the hub's `.eval_results`, Every Eval Ever, and plain Parquet."""
 
 from __future__ import annotations
 
@@ -28,32 +28,33 @@ from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
-OURS = "traps-pipeline"  # makes the reference models
-EVER_SCHEMA = "0.3.0"  # of Every Eval Ever
+OURS = "traps-pipeline"  # developer of the reference models
+EVER_SCHEMA = "0.3.0"  # schema version of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
 Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Who:
-    """Who made the evaluation, and who develops the models that are no reference models."""
+class Attribution:
+    """The evaluating organization, and the developer of all models except reference models."""
 
     organization: str = "unknown"
     developer: str = "unknown"
 
-    def made(self, model: str) -> str:
-        """Return who made a model."""
+    def developer_of(self, model: str) -> str:
+        """Return a model's developer."""
         return OURS if is_reference(model) else self.developer
 
 
-def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) -> list[str]:
-    """Write the overall figures of every model that has them, and all rows as Parquet; returns the files.
+def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribution) -> list[str]:
+    """Write the overall figures of every model that has them, and all rows as Parquet; return the files.
 
-    dataset: the repository that holds the release, as the hub names it.
+    dataset: the repository of the release, as the hub names it.
+
     `eval_results/MODEL.yaml` goes into the model's repository as `.eval_results/traps.yaml`, with a task for each
-    regime; `data/` is laid out as Every Eval Ever's, with each figure and its interval. Raises TrapsError where there
-    is no overall figure.
+    regime; `data/` has the layout of Every Eval Ever, with each figure and its interval. Raises TrapsError if there is
+    no overall figure.
     """
     if not _REPOSITORY.fullmatch(dataset):
         raise TrapsError(f"--dataset {dataset!r:.80}: is no repository of the hub; write it as OWNER/NAME")
@@ -75,8 +76,8 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
         record = _ever_record(str(model), entries, dataset, who, when, release)
-        name = uuid.UUID(digest(record)[:32], version=4)  # the collection wants random ones; these are the content's
-        files.append(f"{EVER}/{release.name}/{who.made(str(model))}/{model}/{name}.json")
+        name = uuid.UUID(digest(record)[:32], version=4)  # in the form of the random ids that the collection asks for
+        files.append(f"{EVER}/{release.name}/{who.developer_of(str(model))}/{model}/{name}.json")
         write_text(target / files[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     write_bytes(target / PARQUET, table_bytes(LEADERBOARD, board))
     return [*files, PARQUET]
@@ -93,7 +94,7 @@ def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
 
 
 def _ever_record(
-    model: str, rows: list[dict[str, Any]], dataset: str, who: Who, when: pd.Timestamp, release: Release
+    model: str, rows: list[dict[str, Any]], dataset: str, who: Attribution, when: pd.Timestamp, release: Release
 ) -> dict[str, Any]:
     seconds = str(int(when.timestamp()))
     return {
@@ -110,8 +111,8 @@ def _ever_record(
         "eval_library": {"name": "traps-pipeline", "version": version("traps-pipeline")},
         "model_info": {
             "name": model,
-            "id": f"{who.made(model)}/{model}",
-            "developer": who.made(model),
+            "id": f"{who.developer_of(model)}/{model}",
+            "developer": who.developer_of(model),
             "additional_details": _UNKNOWN,
         },
         "evaluation_results": [one for row in rows for one in _ever_results(row, dataset, release)],

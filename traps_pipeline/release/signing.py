@@ -1,7 +1,7 @@
-"""The signature of a released folder: the OpenSSF's format, by a key, checked without a network.
+"""Sign a released folder with a key, in the OpenSSF's format, verifiable offline.
 
-`model_signing` is an extra, and is imported only here. A signature by an elliptic key holds a random number, so it is
-the one file of a release that differs when it is made twice.
+`model_signing` is an extra, and is imported only here. A signature by an elliptic key contains a random number, so it
+is the only file of a release that differs between two builds.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def sign(folder: Path, private_key: Path) -> Path:
 
 
 def check_signature(folder: Path, public_key: Path) -> str:
-    """Return what is wrong with a folder's signature, or nothing. Raises TrapsError for want of library or file."""
+    """Return what is wrong with a folder's signature, or nothing. Raises TrapsError for a missing library or file."""
     library, path = _library(), folder / SIGNATURE
     if not path.is_file():
         raise TrapsError(f"{path}: is missing, so that there is nothing to verify; leave --key out")

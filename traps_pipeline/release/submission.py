@@ -1,7 +1,7 @@
 """A submission: one file with a study's items, answers, votes and numbers, which anybody can verify.
 
-The file is a zip of Parquet tables and one JSON; nothing in it is executed. It comes from strangers: names, sizes and
-schemas are checked before anything is read, and nothing is written to a disk.
+The file is a zip of Parquet tables and one JSON; nothing in it is executed. It is untrusted: names, sizes and schemas
+are checked before anything is read, and nothing is written to disk.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class SeatEntry(_Strict):
-    """A judge as a submission describes it: what decides its votes, no address and no key."""
+class SubmittedJudge(_Strict):
+    """A judge in a submission: everything that decides its votes, without address and key."""
 
     id: str = Field(max_length=200)
     backend: str = Field(max_length=50)
@@ -63,15 +63,18 @@ class SeatEntry(_Strict):
 
 
 class About(_Strict):
-    """`submission.json`. panel: name of the panel. prompts: version of each regime's. versions: of the code that made
-    the tables. files: SHA-256 of each table."""
+    """The contents of `submission.json`.
+
+    panel: name of the panel. prompts: version of each regime's. versions: of the code that made the tables. files:
+    SHA-256 of each table.
+    """
 
     format: Literal[1] = 1
     name: Name
     benchmark: str = Field(max_length=200)
     version: str = Field(max_length=200)
     panel: str = Field(max_length=200)
-    judges: tuple[SeatEntry, ...] = Field(min_length=1, max_length=10, strict=False)
+    judges: tuple[SubmittedJudge, ...] = Field(min_length=1, max_length=10, strict=False)
     judged_by_rules: bool
     prompts: dict[str, str]
     versions: dict[str, str]
@@ -80,7 +83,7 @@ class About(_Strict):
 
 @dataclass(frozen=True)
 class Submission:
-    """A submission in memory. altered: tables that are not what `about` says was packed."""
+    """A submission in memory. altered: tables whose digest differs from `about`."""
 
     path: Path
     about: About
@@ -96,7 +99,10 @@ class Submission:
 
 
 def pack(workspace: Workspace, target: Path, name: str) -> About:
-    """Write a study's submission, equal bytes for equal studies. Raises TrapsError if not judged or scored yet."""
+    """Write a study's submission, equal bytes for equal studies.
+
+    Raises TrapsError if it is not judged or scored yet.
+    """
     study = workspace.study
     frames = {
         "items.parquet": workspace.tables.read_all(ITEMS, dataset=DATASETS),
@@ -111,7 +117,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
     frames["votes.parquet"] = frames["votes.parquet"].loc[lambda votes: votes["panel"] == panel_id(study.panel)]
     content = {file: table_bytes(TABLES[file], frame) for file, frame in frames.items()}
     seats = [
-        SeatEntry.model_validate({name: getattr(seat, name) for name in SeatEntry.model_fields})
+        SubmittedJudge.model_validate({name: getattr(seat, name) for name in SubmittedJudge.model_fields})
         for seat in load_panel(study.panel)
     ]
     try:
@@ -133,7 +139,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
 
 
 def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
-    """Return the rows of a table as Parquet, in the order of its key: equal rows give equal bytes."""
+    """Return the rows of a table as Parquet, sorted by its key: equal rows give equal bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -158,7 +164,7 @@ def _zipped(content: Mapping[str, bytes]) -> bytes:
 
 
 def read_submission(path: Path) -> Submission:
-    """Return a submission. Raises TrapsError for other names or columns, too much, compression, or no table."""
+    """Return a submission. Raises TrapsError for unexpected names, columns, sizes, compression or formats."""
     try:
         size = path.stat().st_size
         if size > MOST_FILE_BYTES:
@@ -197,7 +203,7 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
-    """Return a table whose size was looked at before it is unpacked, and whose columns are those of this version."""
+    """Return a table whose size is checked before it is unpacked, and whose columns are those of this version."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,4 +1,4 @@
-"""A leaderboard of many submissions: each is verified, and those of the same items and panel are ranked together."""
+"""A leaderboard of submissions: verify each, and rank those with the same items and panel together."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.models.judges import id_of_seats
+from traps_pipeline.models.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
-from traps_pipeline.release.verification import Verified, verify
+from traps_pipeline.release.verification import Verification, verify
 from traps_pipeline.report.leaderboard_page import leaderboards, legend
 from traps_pipeline.report.writing import environment, table_html
-from traps_pipeline.scoring.scored import score
+from traps_pipeline.scoring.scores import score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 
 PAGE, TABLE = "index.html", "leaderboard.parquet"
@@ -27,36 +27,36 @@ TITLE = "TRAPSBench: submissions"
 
 
 @dataclass(frozen=True)
-class Accepted:
-    """A submission without a problem, and what its verification found."""
+class AcceptedSubmission:
+    """A submission without problems, and its verification."""
 
     submission: Submission
-    verified: Verified
+    verified: Verification
 
     @property
     def name(self) -> str:
-        """As it calls itself."""
+        """The submission's own name."""
         return self.submission.about.name
 
     @property
     def group(self) -> tuple[str, str]:
-        """The digest of its items, and its panel: with which submissions it may be ranked."""
+        """The digest of its items, and its panel: submissions with the same group are ranked together."""
         items = self.submission.table(ITEMS)
         about = self.submission.about
-        return digest(sorted(items["item_hash"]))[:16], id_of_seats(about.panel, about.judges)
+        return digest(sorted(items["item_hash"]))[:16], id_of_judges(about.panel, about.judges)
 
 
 @dataclass(frozen=True)
-class Refused:
-    """A file that is not ranked, and why."""
+class RefusedSubmission:
+    """A file that is not ranked, with the reason."""
 
     name: str
     problems: Sequence[str]
 
 
 @dataclass(frozen=True)
-class Group:
-    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission where names repeat."""
+class RankedGroup:
+    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission if names repeat."""
 
     items: str
     panel: str
@@ -67,7 +67,7 @@ class Group:
 
     @property
     def title(self) -> str:
-        """What its entries have in common, in words."""
+        """The common properties of its entries, in words."""
         return f"Benchmark {self.versions}, {self.n_items} items ({self.items[:8]}), panel {self.panel}"
 
 
@@ -75,26 +75,26 @@ class Group:
 class Board:
     """All submissions of a page."""
 
-    groups: list[Group] = field(default_factory=list)
-    accepted: list[Accepted] = field(default_factory=list)
-    refused: list[Refused] = field(default_factory=list)
+    groups: list[RankedGroup] = field(default_factory=list)
+    accepted: list[AcceptedSubmission] = field(default_factory=list)
+    refused: list[RefusedSubmission] = field(default_factory=list)
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
-    """Verify submissions and rank those that hold. Raises TrapsError where two have one name, and where none holds."""
+    """Verify submissions and rank the valid ones. Raises TrapsError if two have one name, and if none is valid."""
     board = Board()
     for path in paths:
         try:
             submission = read_submission(path)
         except TrapsError as error:
-            board.refused.append(Refused(path.name, [str(error)]))
+            board.refused.append(RefusedSubmission(path.name, [str(error)]))
             say(f"{path}: refused")
             continue
         verified = verify(submission, release)
         if verified.problems:
-            board.refused.append(Refused(path.name, verified.problems))
+            board.refused.append(RefusedSubmission(path.name, verified.problems))
         else:
-            board.accepted.append(Accepted(submission, verified))
+            board.accepted.append(AcceptedSubmission(submission, verified))
         say(f"{path}: {'refused' if verified.problems else 'verified'}")
     names = Counter(one.name for one in board.accepted)
     twice = [name for name, n in names.items() if n > 1]
@@ -103,14 +103,14 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
     if not board.accepted:
         why = "; ".join(f"{one.name}: {one.problems[0]}" for one in board.refused[:3])
         raise TrapsError(f"no submission holds, so there is nothing to rank ({why})")
-    groups: dict[tuple[str, str], list[Accepted]] = {}
+    groups: dict[tuple[str, str], list[AcceptedSubmission]] = {}
     for one in board.accepted:
         groups.setdefault(one.group, []).append(one)
     board.groups = [_group(key, members) for key, members in sorted(groups.items())]
     return board
 
 
-def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
+def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> RankedGroup:
     """Return the members' verdicts scored together, so that their differences are paired over the same scenarios."""
     owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
@@ -122,12 +122,12 @@ def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
     verdicts = pd.concat(parts, ignore_index=True)
     versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))
     items = len(members[0].submission.table(ITEMS))
-    return Group(*key, versions, items, score(verdicts).board, submissions)
+    return RankedGroup(*key, versions, items, score(verdicts).board, submissions)
 
 
-def _verdicts(one: Accepted) -> pd.DataFrame:
+def _verdicts(one: AcceptedSubmission) -> pd.DataFrame:
     verdicts = one.verified.verdicts
-    assert verdicts is not None  # without verdicts there is a problem, and it is not accepted
+    assert verdicts is not None  # a submission without verdicts has a problem, and is not accepted
     return verdicts
 
 

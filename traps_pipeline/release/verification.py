@@ -1,5 +1,6 @@
-"""Verification of a submission: its votes are cast again where that needs no key, every number is computed again from
-them, and items, prompts and media are held against a release. What cannot be checked is said.
+"""Verify a submission: recast its votes if that needs no key, recompute every number, and compare with a release.
+
+Items, prompts and media are compared with the release's. The result names what cannot be checked.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from traps_pipeline.judging.rules import RuleJudge
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judged_answers import is_correct
-from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_seats
+from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_judges
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import degenerate
 from traps_pipeline.models.registry import is_reference
@@ -34,29 +35,32 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.submission import Submission
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
-from traps_pipeline.scoring.scored import Scored, score
+from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
 
-SHOWN = 10  # sentences of one kind; the others are counted
-CLOSE = 1e-9  # figures of another machine's linear algebra may differ in their last digits
+SHOWN = 10  # sentences per kind; further ones are counted
+CLOSE = 1e-9  # tolerance: linear algebra of another machine may differ in the last digits
 _SAME = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
 Row = Mapping[str, Any]
 
 
 @dataclass
-class Verified:
-    """What verification found: problems, each a sentence; what was checked, and what could not be. verdicts and scored:
-    made again from the votes, None where that is impossible."""
+class Verification:
+    """The result of a verification.
+
+    problems: one sentence each; checked and unchecked: what was verified, and what could not be. verdicts and scored:
+    recomputed from the votes, None if that is impossible.
+    """
 
     problems: list[str] = field(default_factory=list)
     checked: list[str] = field(default_factory=list)
     unchecked: list[str] = field(default_factory=list)
     verdicts: pd.DataFrame | None = None
-    scored: Scored | None = None
+    scored: Scores | None = None
 
     def look(self, what: str, complaints: Iterator[str]) -> None:
-        """Note a check, and its problems, of which the first are kept and the others counted."""
+        """Record a check and its problems: keep the first ones and count the others."""
         problems = list(complaints)
         self.checked.append(what)
         self.problems += problems[:SHOWN]
@@ -64,9 +68,9 @@ class Verified:
             self.problems.append(f"... and {len(problems) - SHOWN} more of this kind")
 
 
-def verify(submission: Submission, release: Path | None = None) -> Verified:
-    """Verify a submission, against a released folder if given. Raises TrapsError for a release that cannot be read."""
-    verified = Verified()
+def verify(submission: Submission, release: Path | None = None) -> Verification:
+    """Verify a submission, against a released folder if given. Raises TrapsError for an unreadable release."""
+    verified = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
     verified.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
@@ -74,7 +78,7 @@ def verify(submission: Submission, release: Path | None = None) -> Verified:
     verified.look("prompts", _wrong_prompts(submission))
     verified.look("answers", _wrong_answers(answers, items))
     verified.look("panel", _wrong_panel(submission, votes))
-    by_rules = all(seat.backend == RULE for seat in submission.about.judges)
+    is_judged_by_rules = all(seat.backend == RULE for seat in submission.about.judges)
     verified.look("votes", _wrong_votes(submission, votes, answers, items))
     _numbers(verified, submission)
     if release is None:
@@ -83,7 +87,7 @@ def verify(submission: Submission, release: Path | None = None) -> Verified:
         verified.look("items and clips against the release", _strangers(items, release))
     verified.unchecked.append("that the answers are the model's: only who asked it knows")
     verified.unchecked.append("that the clips named by digest are those that the model was sent")
-    if not by_rules:
+    if not is_judged_by_rules:
         verified.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
     return verified
 
@@ -178,7 +182,7 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
 
 def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
     about = submission.about
-    own = id_of_seats(about.panel, about.judges)
+    own = id_of_judges(about.panel, about.judges)
     for panel in sorted({row["panel"] for row in votes} - {own}):
         yield f"panel {panel!r:.100}: these judges and this version's prompts are {own}"
     if RULE in {seat.backend for seat in about.judges} and not about.judged_by_rules:
@@ -229,7 +233,7 @@ def _cast_again(task: str, user: str) -> Outcome:
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from what it must be; an item of another kind than it says decides nothing."""
+    """Return how a vote differs from the correct one; an item with a wrong kind decides nothing."""
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:
@@ -237,7 +241,7 @@ def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _difference(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from what it must be, in words; empty where it does not."""
+    """Return how a vote differs from the correct one, in words; empty if it does not."""
     decision = "abstained" if row["task"] == "abstention" else "correct"
     if again is not None:
         vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
@@ -259,9 +263,9 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def _numbers(verified: Verified, submission: Submission) -> None:
-    """Compute verdicts, metrics and leaderboard from the votes; note how the submission's numbers differ from them."""
-    own = id_of_seats(submission.about.panel, submission.about.judges)
+def _numbers(verified: Verification, submission: Submission) -> None:
+    """Compute verdicts, metrics and leaderboard from the votes; record how the submission's numbers differ."""
+    own = id_of_judges(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables

@@ -1,4 +1,4 @@
-"""One scenario with all its arms: what each of them shows, and what is right for it."""
+"""Contact sheets of one scenario with all its arms: the clip of each, and the right answer to it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOMENTS = 6  # frames a row
+MOMENTS = 6  # frames per row
 FRAME_IN, WORDS_IN, GAP_IN, HEAD_IN = 1.5, 2.9, 0.06, 0.8
 SOFT = "#667085"
 _SHEETS = {"arms": ARMS, "panels": (*PANEL_LOOKS, *PANEL_DOSES)}
@@ -29,7 +29,7 @@ _SHEETS = {"arms": ARMS, "panels": (*PANEL_LOOKS, *PANEL_DOSES)}
 
 @dataclass(frozen=True)
 class Row:
-    """A clip on the sheet with its words."""
+    """A clip on the sheet with its captions."""
 
     name: str
     right: str
@@ -38,9 +38,10 @@ class Row:
 
 
 def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, Figure]:
-    """Return `arms_<taxonomy>` of the first scenario with most arms, and `panels_occlusion` of that with most looks.
+    """Return the figures `arms_<taxonomy>` and `panels_occlusion`.
 
-    items: ITEMS rows of the pairs; arms: ARMS rows; clips lie under root. Raises DamagedClip.
+    They show the first scenario with the most arms, and the one with the most looks. items: ITEMS rows of the pairs;
+    arms: ARMS rows; clips lie under root. Raises DamagedClip.
     """
     pairs = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     figures: dict[str, Figure] = {}
@@ -58,7 +59,7 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
 
 
 def _moments(clip: Path) -> np.ndarray:
-    """Return times (MOMENTS,) in seconds that tell what a control shows."""
+    """Return informative times (MOMENTS,) of a control, in seconds."""
     return telling_times(*decode(clip), MOMENTS)
 
 
@@ -76,7 +77,9 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
-    """Return a row a clip, its words on the left, frames at the control's times, hatched behind its end."""
+    """Return a figure with one row per clip: captions on the left, frames at the control's times, hatched after its
+    end.
+    """
     _, tall, wide, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * tall / wide + GAP_IN
     width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in
@@ -105,7 +108,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
 
 
 def _own_words(row: Row, control: Row) -> list[str]:
-    """Return the question of a row that asks other words than the control."""
+    """Return the question of a row whose question differs from the control's."""
     if row.question == control.question:
         return []
     return textwrap.wrap(f"“{row.question}”", 46, max_lines=3, placeholder=" …")

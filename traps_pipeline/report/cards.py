@@ -1,4 +1,4 @@
-"""The parts of the report page: cards of tables, figures and pictures of pairs, and what the paper has beside them."""
+"""Cards of the report page: tables, figures and pictures of pairs, each beside the paper's."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import (
     COLUMN_IN,
-    Behind,
     NotRun,
     PrintedTable,
+    SourceItems,
     environment,
     figure_bytes,
     table_html,
@@ -31,16 +31,16 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-EXPLORER = "index.html"  # beside the report page
+EXPLORER = "index.html"  # path beside the report page
 MEDIA = {"svg": "image/svg+xml", "webp": "image/webp", "csv": "text/csv", "tex": "application/x-tex"}
-Address = Callable[[Behind], str]
+Address = Callable[[SourceItems], str]
 
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page: the study's tables or figures (`html`, escaped), or `why` it was not run; the paper's beside.
+    """A part of the page: the study's tables or figures (`html`, escaped), or `why` it was not run; and the paper's.
 
-    shows: what figures show, in words.
+    shows: a description of the figures.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Card:
 
     @classmethod
     def read(cls, data: bytes) -> Card:
-        """Return the card that `data` wrote."""
+        """Return the card that `data` serialized."""
         return cls(**json.loads(data))
 
     @property
@@ -62,7 +62,7 @@ class Card:
 
 
 class Sources:
-    """The results of a study and of the paper, read when a card first needs them."""
+    """The results of a study and of the paper, loaded on first use."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
@@ -78,7 +78,7 @@ class Sources:
         return PublishedResults()
 
 
-def explorer_address(behind: Behind) -> str:
+def explorer_address(behind: SourceItems) -> str:
     """Return the address of the explorer's view of the answers behind a number."""
     query = {name: value for name, value in vars(behind).items() if value}
     return f"{EXPLORER}#/answers" + (f"?{urlencode(query)}" if query else "")
@@ -96,7 +96,7 @@ def table_card(report: TableReport, sources: Sources, address: Address | None = 
 
 
 def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
-    """Return the card whose html is the paper's tables or figure of the kind; empty where it has none."""
+    """Return the card with the paper's tables or figure of this kind; empty if it has none."""
     if isinstance(report, FigureReport):
         try:
             pictures = {"The paper’s": _picture(f"{report.name}_published", report.figure(sources.paper))}
@@ -111,7 +111,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
-    """Return title (where it differs from the card's), fragment and downloads by file name of each table."""
+    """Return title (if it differs from the card's), fragment and downloads by file name of each table."""
     return [
         {
             "title": table.title if table.title != title else "",
@@ -139,7 +139,7 @@ def figure_card(report: FigureReport, sources: Sources) -> Card:
 
 
 def picture_card(picture: Picture) -> Card:
-    """Return the card of pictures made from clips."""
+    """Return the card of pictures of clips."""
     try:
         images = [_picture(name, figure, picture.kind) for name, figure in picture.figures().items()]
     except NotRun as reason:
@@ -158,7 +158,7 @@ def _picture(name: str, figure: Figure, kind: str = "svg") -> Mapping[str, str]:
 
 
 def data_address(kind: str, content: bytes) -> str:
-    """Return a file as an address that holds its content."""
+    """Return a data URL of a file."""
     return f"data:{MEDIA[kind]};base64,{b64encode(content).decode('ascii')}"
 
 

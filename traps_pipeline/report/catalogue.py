@@ -1,6 +1,6 @@
-"""Every table and figure by name: what makes it from `Results`, and the stages it reads (docs/spec.md 10).
+"""The catalogue of tables and figures: each one's function of `Results`, and the stages it reads (docs/spec.md 10).
 
-Its asset, staleness and place on the report page and in `traps results export` follow from its entry.
+An entry decides its asset, staleness and place on the report page and in `traps results export`.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from traps_pipeline.report.writing import SOFT, NotRun, PrintedTable, figure_fil
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RIGHT_EDGE_IN = 0.14  # for a line of text along the right edge of a figure
+RIGHT_EDGE_IN = 0.14  # width for a line of text along the right edge of a figure
 PAPER = "published"  # folder below tables/ and figures/
-RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the paper's tables
-# Stages whose tables hold figures that the panel decided: what reads one of them says who judged. Tests hold this
-# against the graph.
+RECOMPUTED = "recomputed"  # folder below tables/ for tables computed from the paper's
+# Stages whose tables hold decisions of the panel: reports that read them name the judges. A test compares this
+# with the graph.
 JUDGED_STAGES = {
     *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "graded", "leave_one_out"),
     *("item_scores", "corrected", "gate", "risk_coverage"),
@@ -55,29 +55,31 @@ JUDGED_STAGES = {
 
 @dataclass(frozen=True)
 class TableReport:
-    """A table (or several that belong together). reads: the stages whose tables it is made from; paper: the paper's
-    tables of the kind, as it prints them; recomputed: the names of those of its tables that `make` computes from the
-    paper's tables too, since their figures do not stand there."""
+    """A table (or several that belong together).
+
+    reads: the stages whose tables it uses; paper: the paper's tables of this kind, as printed; recomputed: the names of
+    its tables that `make` also computes from the paper's tables, since the paper does not print their figures.
+    """
 
     name: str
     make: Callable[[Results], list[PrintedTable]]
     reads: tuple[str, ...]
     paper: Callable[[], list[PrintedTable]] | None = None
     recomputed: tuple[str, ...] = ()
-    title: str = ""  # of several tables together; by default the title of the first one
+    title: str = ""  # title of several tables together; default: the first one's
 
     @property
     def doc(self) -> str:
-        """What it shows."""
+        """The caption."""
         return _first_paragraph(self.make)
 
     @property
     def published(self) -> bool:
-        """Whether there is anything of the paper's to show."""
+        """Whether the paper has anything to show here."""
         return self.paper is not None or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """Return the tables, made once; of the paper those recomputed, without columns that have no figure."""
+        """Return the tables, cached; for the paper the recomputed ones, without empty columns."""
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -91,11 +93,11 @@ class TableReport:
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's own tables, and what stands only in its text."""
+        """Return the paper's own tables, and figures that only its text states."""
         return [*(self.paper() if self.paper else []), *printed_tables.in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path below `tables`; of the paper below `tables/published` and `tables/recomputed`."""
+        """Return files by path below `tables`; for the paper below `tables/published` and `tables/recomputed`."""
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
@@ -106,7 +108,7 @@ class TableReport:
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure. reads: the stages whose tables it is made from; published: whether the paper prints its numbers."""
+    """A figure. reads: the stages whose tables it uses; published: whether the paper prints its numbers."""
 
     name: str
     title: str
@@ -117,15 +119,15 @@ class FigureReport:
 
     @property
     def doc(self) -> str:
-        """What it shows."""
+        """The caption."""
         return _first_paragraph(self.make)
 
     def note(self, results: Results) -> str:
-        """Return what it says of a study, in one sentence a model where it has one, and what it shows."""
+        """Return the finding about a study, with one sentence per model if it has one, and the caption."""
         return f"{self.finding(results)} {self.doc}".strip()
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return PDF, SVG and PNG by path; none if the figure was not run."""
+        """Return PDF, SVG and PNG by path; empty if the figure was not run."""
         try:
             files = figure_files(self.name, self.figure(results))
         except NotRun:
@@ -133,7 +135,7 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure, which says so itself where rules judged. Raises NotRun where it has no data."""
+        """Return the figure, with a note if rules judged. Raises NotRun without data."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
@@ -225,17 +227,17 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("cosines", "Cosines of void directions", steering_figures.cosine_heatmaps, ("cosines",)),
 )  # fmt: skip
 
-# Figures that a study leads with which looked inside models: the claim, and what can refute it.
+# Leading figures of a study with mechanistic analyses: the claim, and its possible refutations.
 INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patching", "doses_among_nulls")
 
 
 def folder(kind: str, results: Results) -> str:
-    """Return the folder of a kind, `tables` or `figures`; the paper's files are in a folder below it."""
+    """Return the folder of a kind, `tables` or `figures`; the paper's files are in a subfolder of it."""
     return kind if results.is_study else f"{kind}/{PAPER}"
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure, or along its right edge where its layout leaves no room there."""
+    """Write a line at the foot of a figure, or along its right edge if its layout leaves no room there."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
@@ -250,11 +252,11 @@ def _say_below(figure: Figure, text: str) -> None:
 
 
 def _is_judged(reads: Sequence[str]) -> bool:
-    """Return whether a report shows numbers that a panel decided, by the stages that it reads."""
+    """Return whether a report shows decisions of a panel, by the stages that it reads."""
     return bool({*reads} & JUDGED_STAGES)
 
 
 def _first_paragraph(make: Callable[..., object]) -> str:
-    """Return the first paragraph of a docstring as a caption, without the verb that says what a function does."""
+    """Return the first paragraph of a docstring as a caption, without the verb `Return`."""
     text = " ".join((make.__doc__ or "").split("\n\n")[0].split()).removeprefix("Return ")
     return text[:1].upper() + text[1:]

@@ -20,15 +20,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GAP = 8  # pixels between frames
-FOOTER_IN = 0.2  # room for the times below a pair's frames
+FOOTER_IN = 0.2  # pixels for the times below a pair's frames
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Widths (inches) and words of a pair: by default as for the width of a printed page, on which no text may be
-    smaller than 6 points. header: room for the words above its frames; letters: of a question on a line; questions:
-    lines of each question at most; ids: whether its scenario is named; moments: frames per clip; columns: pairs beside
-    each other."""
+    """Widths (inches) and texts of a pair.
+
+    The defaults fit the width of a printed page, on which no text may be smaller than 6 points. header: room for the
+    words above its frames; letters: of a question per line; questions: maximum lines of each question; ids: whether its
+    scenario is named; moments: frames per clip; columns: pairs side by side.
+    """
 
     block: float = 1.98
     header: float = 0.86
@@ -43,7 +45,7 @@ class Layout:
 
     @property
     def small(self) -> float:
-        """The size of words between and below frames."""
+        """The font size of texts between and below frames."""
         return min(self.size, 7)
 
 
@@ -83,8 +85,10 @@ def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figu
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
-    """Return ITEMS rows of six visual pairs for a figure like the paper's: three of each taxonomy, no two of one
-    sub-scenario and of different categories where possible; fewer if there are fewer sub-scenarios."""
+    """Return ITEMS rows of six visual pairs for a figure like the paper's: three per taxonomy.
+
+    No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
+    """
     visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     chosen: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
@@ -96,7 +100,7 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the pairs that have both sides, occlusion first, as frames of two rows indexed by side."""
+    """Return the complete pairs, occlusion first, as frames of two rows indexed by side."""
     complete = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
     complete = complete.assign(place=complete["dataset"].map(DATASETS.index)).sort_values(
         ["place", "sub_scenario", "pair_id"]
@@ -105,7 +109,7 @@ def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Return control, void and the times (moments,) in seconds that tell what the control shows."""
+    """Return control, void and informative times (moments,) of the control, in seconds."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, at, moments)
@@ -113,8 +117,11 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
-    """Return times (moments,) from the first to the last of a clip's, `at`; where a panel closes the clip (frames,
-    RGB), to the last one before it comes, and if there are four or more, the clip's last one too."""
+    """Return times (moments,) from the first to the last of a clip's times `at`.
+
+    If an occluder closes the clip (frames, RGB), the last one is just before it, and of four or more the clip's last
+    time is also included.
+    """
     seen = len(before_panel(frames))
     closed = [len(at) - 1] if seen < len(at) and moments > 3 else []
     return at[np.append(np.linspace(0, seen - 1, moments - len(closed)).round(), closed).astype(int)]
@@ -129,7 +136,7 @@ def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledCli
 
 
 def ratio_of(clip: SampledClip) -> float:
-    """Return height over width of a pair's block of frames."""
+    """Return the aspect ratio (height over width) of a pair's block of frames."""
     moments, height, width, _ = clip.frames.shape
     return (2 * height + GAP) / (moments * width + (moments - 1) * GAP)
 
@@ -137,7 +144,7 @@ def ratio_of(clip: SampledClip) -> float:
 def draw_pair(
     axes: Axes, pair: pd.DataFrame, control: SampledClip, void: SampledClip, times: np.ndarray, layout: Layout
 ) -> None:
-    """Draw what `moments_of` gives of a pair: its frames with their times, below the words of `pair`."""
+    """Draw the result of `moments_of`: frames with their times, below the texts of `pair`."""
     from matplotlib.patches import Rectangle
 
     moments, height, width, _ = control.frames.shape
@@ -177,7 +184,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     title = f"{sub_scenario} ({dataset})"
     if layout.ids:
         title = f"{scenario}   {title}   ground truth: {truth}"
-    else:  # a narrow block has the truth on a line of its own
+    else:  # in a narrow block the truth has its own line
         lines.append(f"ground truth: {truth}")
     place: dict[str, Any] = {
         "xycoords": "axes fraction",
@@ -192,7 +199,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the frame resized to the control's size, so that a void clip of another size does not break the sheet."""
+    """Return the frame resized to the control's size, so that clips of different sizes align."""
     if frame.shape[:2] == (height, width):
         return frame
     import cv2

@@ -1,4 +1,4 @@
-"""What the lead figures inside models say of a study, in one sentence a model, from the frames that they draw."""
+"""Findings of the leading mechanistic figures about a study, one sentence per model, from the figures' frames."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 @_joined
 def states_and_output(results: Results) -> Iterator[str]:
-    """Return how many answered voids states and output put among voids, and how well either orders the sides."""
+    """Return how many answered voids states and output classify as voids, and how well each orders the sides."""
     for model, of in _models(scored_items(results)):
         voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
         controls = of.loc[of["side"] == "control"]
@@ -56,7 +56,7 @@ def states_and_output(results: Results) -> Iterator[str]:
 
 @_joined
 def lens(results: Results) -> Iterator[str]:
-    """Yield by how much the guided prompt moves the margin of each side at the last layer and at the one before."""
+    """Yield how far the guided prompt moves the margin of each side at the last layer and at the one before."""
     for model, of in _models(results.lens):
         means = of.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
@@ -93,7 +93,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
 
 @_joined
 def gate_arrows(results: Results) -> Iterator[str]:
-    """Return what the default gate does to PECS, beside the best gate on anything else than states."""
+    """Return the default gate's effect on PECS, and the best gate on features other than states."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     for model, of in _models(rows.loc[rows["pecs"].notna()]):
@@ -136,7 +136,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 @_joined
 def patching(results: Results) -> Iterator[str]:
-    """Return the group of positions that carries most of the difference at the first layer and at the last."""
+    """Return the group of positions with the largest effect at the first layer and at the last."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     for model, of in _models(rows.loc[rows["group"] != "all"]):

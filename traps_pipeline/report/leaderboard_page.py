@@ -1,4 +1,4 @@
-"""The leaderboard of a study (docs/spec.md 5 and 10): one table for a terminal, a README, Dagster and a page.
+"""The leaderboard of a study (docs/spec.md 5 and 10) for a terminal, a README, Dagster and a page.
 
 Model ids, epochs and versions are untrusted text: each medium escapes them.
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
+from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.table_columns import (
@@ -40,9 +40,9 @@ from traps_pipeline.report.terms import (
 from traps_pipeline.report.writing import (
     NONE,
     NOT_RUN,
-    Behind,
     Column,
     PrintedTable,
+    SourceItems,
     fraction,
     percent,
     table_markdown,
@@ -54,7 +54,7 @@ from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.tables import records
 
 BOUNDS = "If missing: worst, best"
-# Columns that are shown only if their count, or that of another field, is not 0, because the table is wide already.
+# Columns shown only if their count, or that of another field, is not 0, because the table is already wide.
 OPTIONAL = {
     Column("n_refused", "Refused", "count"): "n_refused",
     Column("n_empty", "Empty", "count"): "n_empty",
@@ -111,7 +111,7 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows, with ROBUST figures and further notes, as text: a table for each panel, best first."""
+    """Return LEADERBOARD rows, with ROBUST figures and further notes, as text: a table per panel, best first."""
     return "\n".join(table_text(table) for table in leaderboards(board, robust, notes, brief=True))
 
 
@@ -125,10 +125,10 @@ def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None
 def leaderboards(
     board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
-    """Return tables of LEADERBOARD rows for each panel: one that ranks the entries, then one for each other dataset.
+    """Return tables of LEADERBOARD rows for each panel: one that ranks the entries, then one per other dataset.
 
     The first is `overall`, or the board's first dataset if no model has all four. An entry without a row comes last.
-    notes: further notes of the first table. brief: the first of each panel alone, narrower.
+    notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
     """
     panels = [_of_one_panel(part, robust, brief, suffix) for suffix, part in _by_panel(board)]
     tables = [table for of_panel in panels for table in of_panel[: 1 if brief else None]]
@@ -159,7 +159,7 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
-    """Return the entries of LEGEND for the columns and marks that the board has."""
+    """Return the entries of LEGEND for the board's columns and marks."""
     needed = {column.heading: field for column, field in OPTIONAL.items()}
     needed |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
@@ -178,14 +178,14 @@ def provenance(board: pd.DataFrame) -> str:
 
 
 def judged_by(board: pd.DataFrame) -> str:
-    """Return a sentence that names the panels that judged, and says where their figures are not comparable."""
+    """Return a sentence that names the panels, and says which of their figures are not comparable."""
     panels = _distinct(board["panel"].unique(), "+")
     names = [_panel_in_words(panel) for panel in panels]
     several = len(panels) > 1
     sentence = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
     sentence += "; figures of different panels are not ranked or compared" * several
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
-    others = sorted({model for panel, model in rows if by_rules(panel, model)})
+    others = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
     names_shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
     return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if others else "")
 
@@ -240,7 +240,7 @@ def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
 
 
 def _notes_on_arms(beside: Robust) -> list[str]:
-    """Return notes that name the arms of each entry, and the reasons why pairs and arms are not joined."""
+    """Return notes on the arms of each entry, and on why pairs and arms are not joined."""
     entries: dict[tuple[str, ...], list[str]] = {}
     for (model, regime), row in beside.items():
         entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
@@ -252,7 +252,7 @@ def _notes_on_arms(beside: Robust) -> list[str]:
     return [*notes, *(f"no conjunction and no robust figure: {why}" for why in refused)]
 
 
-def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
+def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     if row.get(field) == NOT_RUN:
         return None
     return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)
@@ -294,7 +294,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
 
 
 def _mark(row: Mapping[str, Any]) -> str:
-    """Return the marks of a PECS: that too little is answered, that what is answered is broken."""
+    """Return the marks of a PECS: too few answers, or too many broken ones."""
     return (INCOMPLETE_MARK if row["incomplete"] else "") + (BROKEN_MARK if row["is_broken"] else "")
 
 
@@ -303,7 +303,7 @@ def _bounds(row: Mapping[str, Any]) -> str:
 
 
 def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
-    """Sort key: best PECS first, nulls last; ties by model, then in the order of the regimes."""
+    """Return the sort key: best PECS first, nulls last; ties by model, then in the order of the regimes."""
     pecs = float(entry.get("pecs", float("nan")))
     null = pecs != pecs
     regimes = (*REGIMES, entry["regime"])

@@ -1,4 +1,4 @@
-"""Printed numbers as numbers, for files that other programs read."""
+"""Parse printed numbers, for files that other programs read."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _PRINTED_NUMBER = re.compile(r"([+−-]?(?:\d+(?:\.\d*)?|\.\d+))(%?)")
 
 
 def as_numbers(values: pd.Series) -> pd.Series:
-    """Return a column of printed numbers (the paper's) as numbers, a dash as missing; any other column as it is.
+    """Return a column of the paper's printed numbers as numbers, a dash as missing; other columns unchanged.
 
-    A number in percent stays as it is printed in a field whose name ends in `_pct`, and is a fraction in any other.
+    A number in percent stays in percent in a field whose name ends in `_pct`, and becomes a fraction in any other.
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""The report page: findings, the leaderboard, what was run, and in one list what was not (docs/report.md)."""
+"""The report page: findings, the leaderboard, the results, and a list of what was not run (docs/report.md)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pandas as pd
 
 from traps_pipeline.report.cards import Address, Card, tables_html
 from traps_pipeline.report.leaderboard_page import leaderboards, legend, provenance
-from traps_pipeline.report.study_findings import Finding
+from traps_pipeline.report.study_findings import StudyFinding
 from traps_pipeline.report.writing import TEMPLATES, environment
 
 FIRST = "figure-pecs_landscape"  # beside the leaderboard
@@ -22,7 +22,7 @@ def report_html(
     pictures: Sequence[Card] = (),
     tables: Sequence[Card] = (),
     *,
-    findings: Sequence[Finding] = (),
+    findings: Sequence[StudyFinding] = (),
     address: Address | None = None,
     explorer: str = "",
     robust: pd.DataFrame | None = None,
@@ -31,11 +31,11 @@ def report_html(
 ) -> str:
     """Render the report as one page that opens from disk and makes no network request.
 
-    Cards that were run are shown, tables in a collapsed appendix; of the others the reasons are listed. With `address`
-    every number is a link to the items behind it. notes: those below the leaderboard; terms: words of the legend.
+    Cards with results are shown, tables in a collapsed appendix; for the others the reasons are listed. With `address`
+    every number links to the items behind it. notes: those below the leaderboard; terms: words of the legend.
     """
     boards = leaderboards(board, robust, notes)
-    ranked = [table for table in boards if table.title == boards[0].title]  # one for each panel
+    ranked = [table for table in boards if table.title == boards[0].title]  # one per panel
     others = [
         Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(
             own=tables_html([table], table.title, address), absent=[], published={}))

@@ -27,10 +27,10 @@ NO_ITEMS = "this study has no items yet"
 
 @dataclass(frozen=True)
 class Picture:
-    """One or several figures made from clips, by file name.
+    """One or several figures of clips, by file name.
 
-    make: raises NotRun and DamagedClip. inputs: the rows that they show, as JSON; null where all rows of the stages
-    `reads` matter. kind: "webp" where they show frames, else "svg".
+    make: raises NotRun and DamagedClip. inputs: the rows that they show, as JSON; null if all rows of the stages
+    `reads` matter. kind: "webp" if they show frames, else "svg".
     """
 
     name: str
@@ -112,5 +112,7 @@ class PairPictures:
 
 
 def _as_json(rows: pd.DataFrame) -> str:
-    """Return the rows without the benchmark's version, which a correction changes in rows that it does not touch."""
+    """Return the rows as JSON without the benchmark's version, which also changes in rows that a correction leaves
+    alone.
+    """
     return str(rows.drop(columns=["benchmark_version"], errors="ignore").to_json(orient="records"))

@@ -1,4 +1,4 @@
-"""The paper's tables as the paper prints them (`assets/published`), without any arithmetic on their figures."""
+"""The paper's tables as printed (`assets/published`), without any arithmetic on their figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.report.tables.table_columns import DATASET, MODEL, titled
+from traps_pipeline.report.tables.table_columns import DATASET, MODEL, with_titles
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.scoring.analyses import models_of
@@ -27,7 +27,7 @@ PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Trans
 
 
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
-    """Return the paper's table `name` of `tables.csv`, which has its title, its place in the paper and its notes."""
+    """Return the paper's table `name`, with title, place in the paper and notes from `tables.csv`."""
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
     where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
@@ -38,12 +38,12 @@ def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> Printe
 
 
 def figures(names: Mapping[str, str]) -> list[Column]:
-    """Return columns of figures (field: heading), which are shown as the paper prints them."""
+    """Return columns of figures (field: heading), shown as the paper prints them."""
     return [Column(field, heading, "range") for field, heading in names.items()]
 
 
 def in_text(card: str) -> list[PrintedTable]:
-    """Return the figures that stand only in the paper's text and belong to this card; no table if there are none."""
+    """Return the figures of this card that only the paper's text states; no table if there are none."""
     rows = as_printed("other").query("card == @card")
     columns = [Column("model", "Model"), Column("quantity", "Quantity")]
     columns += figures({"printed": "Value", "line": "Line"})
@@ -111,7 +111,7 @@ def expanded() -> list[PrintedTable]:
 def replication_per_dataset() -> list[PrintedTable]:
     """Return the two replication families on each dataset under each regime."""
     keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in PRINTED_REGIMES]
-    cells = titled(_cells("replication").set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
+    cells = with_titles(_cells("replication").set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
     return [of_paper("replication_per_dataset", cells, [MODEL, DATASET, REGIME, *figures(SHARES)])]
 
 
@@ -132,7 +132,7 @@ def visual_textual() -> list[PrintedTable]:
 def naive() -> list[PrintedTable]:
     """Return the cells under guided in which Acc × AbsRec exceeds PECS most."""
     rows = as_printed("pecs_vs_naive")
-    rows = titled(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
+    rows = with_titles(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
     names = {"naive": "Naive", "pecs": "PECS", "false_abs_pct": "FA"}
     return [of_paper("pecs_naive", rows, [MODEL, DATASET, *figures(names)])]
 
@@ -188,7 +188,7 @@ def composition() -> list[PrintedTable]:
 
 
 def hyperparameters() -> list[PrintedTable]:
-    """Return what all models and all judges are sent."""
+    """Return the parameters that all models and all judges are sent."""
     columns = [Column("parameter", "Parameter"), *figures({"model_calls": "VLM calls", "judge_calls": "Judge calls"})]
     rows = as_printed("hyperparameters").replace({"judge_calls": {"": "–"}})
     return [of_paper("hyperparameters", rows, columns)]
@@ -197,7 +197,7 @@ def hyperparameters() -> list[PrintedTable]:
 def agreement() -> list[PrintedTable]:
     """Return unanimity and Fleiss' kappa by dataset and task."""
     rows = as_printed("judge_agreement")
-    rows = titled(rows.assign(unanimous_pct=rows["unanimous_pct"] + "%"))
+    rows = with_titles(rows.assign(unanimous_pct=rows["unanimous_pct"] + "%"))
     columns = [DATASET, Column("task", "Judge task"), *figures({"unanimous_pct": "Unan.", "fleiss_kappa": "κ"})]
     return [of_paper("judge_agreement", rows, columns)]
 
@@ -212,7 +212,7 @@ def validation() -> list[PrintedTable]:
 
 
 def confabulation() -> list[PrintedTable]:
-    """Return prevalence of the four axes in six models."""
+    """Return the prevalence of the four axes in six models."""
     rows = as_printed("confabulation_taxonomy")
     names = {"hp_pct": "HP", "ii_pct": "II", "hp_and_ii_pct": "HP∩II", "es_pct": "ES", "doubt_pct": "Doubt"}
     rows[[*names]] = rows[[*names]] + "%"
@@ -310,7 +310,7 @@ def _paths(rows: pd.DataFrame) -> pd.DataFrame:
 
 @cache
 def audit_table() -> PrintedTable:
-    """Return every statement that differs from what the paper's tables give, with its line and the arithmetic."""
+    """Return every statement that differs from the paper's tables, with its line and the arithmetic."""
     from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text  # pandas takes long to import
 
     findings = audit()

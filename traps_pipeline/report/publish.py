@@ -34,12 +34,12 @@ from traps_pipeline.report.writing import NotRun, environment, figure_files, tab
 from traps_pipeline.storage.workspace import Workspace
 
 PAGE, MARKDOWN, METRICS, INDEX = "report.html", "leaderboard.md", "metrics.jsonl", "index.html"
-PAPER = "paper"  # the chapter of cards that stand beside the study's, and follow from `assets/published` alone
+PAPER = "paper"  # the chapter of the paper's cards, which use only `assets/published`
 
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is made. reads: its stages; inputs: instead, the rows that matter, as JSON; null for all."""
+    """A card before it is built. reads: its stages; inputs: instead, the rows that matter, as JSON; null for all."""
 
     chapter: str
     name: str
@@ -49,8 +49,8 @@ class Part:
 
 
 def report_parts(sources: Sources, address: Address | None = explorer_address) -> list[Part]:
-    """Return all parts of the report of a study, in the order of the page. With `address`, numbers are links."""
-    # A study that looked inside models leads with what can refute its claims.
+    """Return all parts of a study's report, in the order of the page. With `address`, numbers are links."""
+    # A study with mechanistic analyses leads with the figures that could refute its claims.
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
         Part("figures", report.name, lambda report=report: figure_card(report, sources), report.reads)
@@ -76,7 +76,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
 def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
-    """Return the report page, the leaderboard as Markdown and as JSON lines, by path. cards: with their chapters."""
+    """Return the report page, the leaderboard as Markdown and as JSON lines, by path. cards: by chapter."""
     remarks = said_by_people(study.human_row, study.panel_errors)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
@@ -93,14 +93,14 @@ def report_files(
 
 
 def metrics_lines(board: pd.DataFrame) -> str:
-    """Return LEADERBOARD rows as JSON lines, which experiment trackers read; a figure that is null is null there."""
+    """Return LEADERBOARD rows as JSON lines, which experiment trackers read, with null for missing figures."""
     return str(board.to_json(orient="records", lines=True, double_precision=15))
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write every table, every figure that was run and the report page to a folder; return the number of files.
+    """Write every table, every available figure and the report page to a folder; return the number of files.
 
-    Each file is written whole or not at all, and last `index.html`, which lists them. say gets a line each.
+    Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """
     sources, paths = Sources(workspace), list[str]()
     for path, content in _exported(sources, say):

@@ -30,7 +30,7 @@ def _cells(results: Results) -> pd.DataFrame:
 
 
 def _overall(results: Results) -> pd.DataFrame:
-    """Return recomputed from the printed per-dataset cells."""
+    """Return the overall rows, recomputed from the printed per-dataset cells."""
     cells = results.cells
     means = analyses.overall(cells).assign(j=lambda rows: rows["abs_rec"] - rows["false_abs"])
     counts = cells.groupby(["model", "regime"]).agg(
@@ -56,7 +56,7 @@ def _rates(results: Results) -> pd.DataFrame:
 
 
 def _none(*columns: str) -> pd.DataFrame:
-    """Return a frame without rows, where nothing follows from the paper's tables beyond what they print."""
+    """Return a frame without rows, for frames that the paper's tables do not determine."""
     return pd.DataFrame(columns=pd.Index(columns))
 
 
@@ -125,9 +125,9 @@ def _as(table: Table, parts: list[pd.DataFrame]) -> pd.DataFrame:
 
 
 class PublishedResults(Results):
-    """The paper's numbers, as shipped in `assets/published`, from which figures are drawn and further tables computed.
+    """The paper's numbers, as shipped in `assets/published`, for figures and further tables.
 
-    `report.printed_tables` shows those that the paper prints. A frame from which neither is made has no rows.
+    `report.printed_tables` shows the tables that the paper prints. A frame without such use has no rows.
     """
 
     source = "published"

@@ -1,4 +1,4 @@
-"""The frames from which tables and figures are made, for a study or for the paper: tidy, with the same columns.
+"""The frames behind tables and figures, for a study or the paper: tidy, with the same columns.
 
 A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
 `epoch`.
@@ -173,7 +173,7 @@ def datasets_of(cells: pd.DataFrame) -> list[str]:
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """Return the parts below each other; without parts, a frame without rows or columns."""
+    """Return the concatenated parts; without parts, a frame without rows or columns."""
     import pandas as pd
 
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

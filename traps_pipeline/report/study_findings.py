@@ -1,4 +1,4 @@
-"""What a study found, in sentences: the first thing on its report. Every number is one of the report's tables."""
+"""A study's main findings, in sentences, for the top of its report page. Every number is in one of its tables."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ ASKED = {STANDARD: "Asked plainly (standard)", GUIDED: "Told not to guess (guide
 
 
 @dataclass(frozen=True)
-class Finding:
+class StudyFinding:
     """A sentence, and the name of the card with its numbers."""
 
     text: str
     card: str
 
 
-def study_findings(results: Results) -> list[Finding]:
+def study_findings(results: Results) -> list[StudyFinding]:
     """Return a study's findings, the most important first; of reference strategies only if no other model was asked."""
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
@@ -41,12 +41,12 @@ def study_findings(results: Results) -> list[Finding]:
     inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
         *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
-        *_missing(own), *(Finding(text, f"figure-{name}") for name, text in inside if text),
+        *_missing(own), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
     ]  # fmt: skip
 
 
-def _best(rows: pd.DataFrame) -> Iterator[Finding]:
-    """Yield the best model of each regime, and how many others the contrasts cannot tell from it."""
+def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
+    """Yield the best model of each regime, and the number of others that the contrasts cannot separate from it."""
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
@@ -59,42 +59,42 @@ def _best(rows: pd.DataFrame) -> Iterator[Finding]:
         alike = ranks(first)
         if len(equal) == 1 and "–" in alike:
             text += f"; its rank may be {alike}, since contrasts do not separate it from others"
-        yield Finding(f"{text}.", "leaderboard")
+        yield StudyFinding(f"{text}.", "leaderboard")
 
 
 def _names(models: list[str]) -> str:
-    """Return up to three names, and how many more there are."""
+    """Return up to three names, and the number of others."""
     first, more = models[:3], len(models) - 3
     parts = [*first, f"{more} more"] if more > 0 else first
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
-def _abstention(rows: pd.DataFrame) -> Iterator[Finding]:
+def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     for regime, words in ASKED.items():
         part = rows.loc[rows["regime"] == regime]
         if len(part):
             who = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
             voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
-            yield Finding(
+            yield StudyFinding(
                 f"{words}, {who} on {voids} of the voids, which cannot be answered, and on {controls} of the "
                 "controls, which can.",
                 "figure-abs_rec",
             )
 
 
-def _accuracy(rows: pd.DataFrame) -> Iterator[Finding]:
-    """Yield by how much guided prompting changes Acc and AbsRec of the models that were asked both ways."""
+def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
+    """Yield how guided prompting changes Acc and AbsRec of the models with both regimes."""
     wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
     if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
         changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
         acc, voids = (_points(changes[name]) for name in ("acc", "abs_rec"))
-        yield Finding(
+        yield StudyFinding(
             f"Guided prompting changes abstention on voids by {voids} points, and accuracy on controls by {acc}.",
             "table-guided_uplift",
         )
 
 
-def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
+def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     """Yield visual against textual voids, and the part of PECS that may come from shortcuts."""
     rates = results.rates
     pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
@@ -102,7 +102,7 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
     if len(pooled):
         textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
         who = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
-        yield Finding(
+        yield StudyFinding(
             f"Asked plainly, {who} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
             f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
             f"{' (means)' if len(pooled) > 1 else ''}.",
@@ -112,14 +112,14 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
     robust = robust.loc[robust["model"].isin(rows["model"])].dropna(subset=["conjunction"]) if len(robust) else robust
     if len(robust):
         most = robust.sort_values(["conjunction", "model"], ascending=[False, True]).to_dict("records")[0]
-        yield Finding(
+        yield StudyFinding(
             f"Control, twin, void and crossed questions of one scene are all right in at most "
             f"{percent(most['conjunction'])} % of the scenes ({most['model']} under {most['regime']}).",
             "leaderboard",
         )
 
 
-def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
+def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     contrasts = results.contrasts
     if len(contrasts):
         models = contrasts["left_model"].isin(rows["model"]) & contrasts["right_model"].isin(rows["model"])
@@ -127,19 +127,19 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[Finding]:
         tested = contrasts.loc[models & of & contrasts["difference"].notna()]
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
-            yield Finding(
+            yield StudyFinding(
                 f"Of {len(tested)} differences of PECS between models under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )
 
 
-def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
+def _missing(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
         answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
-        yield Finding(
+        yield StudyFinding(
             f"{missing} of {answers} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
             f"most, {int(most['n_missing'])}.",
             "leaderboard",
@@ -147,12 +147,12 @@ def _missing(rows: pd.DataFrame) -> Iterator[Finding]:
 
 
 def _span(shares: pd.Series) -> str:
-    """Return the smallest and the largest share in percent, once if they print alike."""
+    """Return the smallest and the largest share in percent, once if they print the same."""
     low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _points(changes: pd.Series) -> str:
-    """Return the smallest and the largest change in points of percent, with their signs."""
+    """Return the smallest and the largest change in percentage points, with their signs."""
     low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
     return low if low == high else f"{low} to {high}"

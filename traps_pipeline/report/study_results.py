@@ -30,7 +30,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def _of_panel(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that the panel of the tables decided: figures of two panels never stand side by side."""
+    """Return the rows that the panel of the tables decided: figures of two panels are never shown together."""
     return rows.loc[rows["panel"] == results.panel].reset_index(drop=True)
 
 
@@ -116,7 +116,7 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows without reference strategies, over which means are taken, if other models were asked."""
+    """Return the rows without reference strategies, if other models were asked; means are taken over these."""
     others = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
     return others if len(others) else rows
 
@@ -145,7 +145,7 @@ class StudyResults(Results):
 
     @cached_property
     def panel(self) -> str:
-        """The panel of all tables and figures: the study's, where it decided any; else the first that did."""
+        """The panel of all tables and figures: the study's, if it decided any; else the first that did."""
         decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
         panels = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
         own = panel_id(self._panel)

@@ -17,7 +17,7 @@ TITLES = {
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
 ARM_TITLES[GRADED] = "Graded cuts"
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
-# What the columns of a leaderboard with arms mean (docs/scoring.md, "Beyond PECS").
+# Legend of a leaderboard with arms (docs/scoring.md, "Beyond PECS").
 ROBUST_TERMS = {
     "Conjunction %": "share of scenarios with control, twin, void and both crossed questions right; 0 for every rule "
     "that abstains for the clip alone or for the question alone",
@@ -25,7 +25,7 @@ ROBUST_TERMS = {
     "compared",
     "Inferred %": "share of the items of late_panel and predictable_cut answered correctly: their outcome is not shown",
 }
-# The side of the items that a share counts.
+# The side whose items a share counts.
 SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 MISSING_MARK = "†"
@@ -40,7 +40,7 @@ MARKS = {
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered",
     BROKEN_MARK: f"broken: {BROKEN_TEXTS}",
 }
-# Words of the tables and figures of what is found inside models; a page without them does not explain them.
+# Terms of mechanistic tables and figures; a page without these does not explain them.
 INSIDE_TERMS = {
     "oc, ch, _ip": "the datasets occlusion and chaotic, with _ip their ill-posed questions; oc→ch: learnt from oc and "
     "applied to ch",

@@ -1,4 +1,4 @@
-"""The worked example: one pair with a model's answer to each side, how the panel read it, and the verdict."""
+"""The worked example: one pair with a model's answer to each side, the panel's votes, and the verdict."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
     from traps_pipeline.storage.workspace import Workspace
 
-SCENE = "seesaw_sorter"  # of the paper's example
+SCENE = "seesaw_sorter"  # the paper's example
 FRAMES = Layout(block=3.0, header=0.62, gap=0.4, letters=64, questions=2, ids=True)
-WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # of the column of words beside the frames
+WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # width of the text column beside the frames
 
 
 @dataclass(frozen=True)
 class Example:
-    """A pair (ITEMS rows indexed by side), a model, and the lines beside the frames of each side."""
+    """A pair (ITEMS rows indexed by side), a model, and the lines of text beside each side's frames."""
 
     pair: pd.DataFrame
     model: str
@@ -37,7 +37,7 @@ class Example:
 
 
 def worked_example(workspace: Workspace) -> Example | None:
-    """Return the example that `chosen_example` takes from a study's verdicts under standard; None if there is none."""
+    """Return the example that `chosen_example` selects from verdicts under standard; None if there is none."""
     verdicts = workspace.tables.read_all(VERDICTS, None, dataset=("occlusion", "chaotic"), regime="standard")
     chosen = chosen_example(verdicts)
     if chosen is None:
@@ -58,8 +58,10 @@ def worked_example(workspace: Workspace) -> Example | None:
 
 
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
-    """Return the control's VERDICTS row of a pair whose control was answered rightly and whose void was decided; None
-    if there is none. Seesaws come first, then models that are no reference strategy, then voids abstained on."""
+    """Return the control's VERDICTS row of a pair with a correct control and a decided void; None without one.
+
+    Seesaws come first, then models that are no reference strategy, then voids abstained on.
+    """
     decided = verdicts.dropna(subset=["abstained"])
     voids = {
         (row["pair_id"], row["model"], row["run"]): bool(row["abstained"])
@@ -81,7 +83,7 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
 
 
 def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
-    """Return the lines beside the frames of a side: the answer, the judges' reading of it, and the verdict."""
+    """Return the lines beside the frames of a side: the answer, the judges' votes, and the verdict."""
     valid = [vote for vote in votes if vote["valid"]]
     on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
@@ -98,7 +100,7 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
 
 
 def example_figure(example: Example, root: Path) -> Figure:
-    """Draw frames of control and void at the left, the words at the right; one page wide. Clips lie under root."""
+    """Draw frames of control and void on the left, the text on the right; one page wide. Clips lie under root."""
     pair, words = example.pair, example.words
     with figure_style():
         block = moments_of(pair, root, FRAMES.moments)

@@ -1,8 +1,8 @@
-"""The one writer of tables and the one writer of figures, which give the same bytes on every build.
+"""Write tables and figures in all formats, with the same bytes on every build.
 
-A `PrintedTable` is a frame of numbers with the columns that are printed; it becomes Parquet and CSV (numbers as they
-are), LaTeX, Markdown, text for a terminal and an HTML fragment (numbers as printed). Its texts are untrusted: each
-medium escapes them. A figure becomes PDF, SVG and PNG.
+A `PrintedTable` is a frame of numbers with printed columns; it becomes Parquet and CSV (unrounded numbers), LaTeX,
+Markdown, text for a terminal and an HTML fragment (printed numbers). Its texts are untrusted: each medium escapes them.
+A figure becomes PDF, SVG and PNG.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0
 
 
 @dataclass(frozen=True)
-class Behind:
-    """The items that a number is computed from; an empty field means all."""
+class SourceItems:
+    """The items behind a number; an empty field means all."""
 
     dataset: str = ""
     model: str = ""
@@ -57,10 +57,10 @@ class Behind:
 
 
 class NotRun(Exception):
-    """A figure has no data; the message says why, for people."""
+    """A figure has no data; the message gives the reason, for people."""
 
 
-Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> the items behind that number
+Trace = Callable[[Mapping[str, Any], str], SourceItems | None]  # row and field -> the items behind that number
 
 
 # --- numbers as printed -----------------------------------------------------------------------------------------------
@@ -90,11 +90,11 @@ def percent(value: float | None, digits: int = 1) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """A printed column: the frame's field, its heading, and how its values are printed.
+    """A printed column: the frame's field, its heading, and its format.
 
     Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard
     deviation, which is printed after ±; `mark` names a field of text, such as a dagger, which is printed after the
-    number. The last three are for pages: the look of the cells (a row's head, an emphasised number, a tag), whether a
+    number. The last three are for pages: the style of the cells (a row's head, an emphasised number, a tag), whether a
     fraction is also drawn as a bar, and whether a group of columns begins here.
     """
 
@@ -119,7 +119,7 @@ class Column:
         return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
     def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
-        """Return the text or number of a cell, its spread and its mark, as printed; empty where it lacks one."""
+        """Return the text or number of a cell, its spread and its mark, as printed; empty if it lacks one."""
         import pandas as pd
 
         value = row.get(self.field)
@@ -141,9 +141,9 @@ class Column:
 class PrintedTable:
     """A table for people: a frame, its printed columns, and notes (epoch, n, missing items).
 
-    A table without rows says that it was not run, and `why`; if it was run and is empty for a good reason, it prints
-    `none` instead. `trace` returns the items behind a number, or None; `dash` and `deviation` are the meanings of a
-    dash and of ±; `lead` is a sentence after the title.
+    A table without rows says that it was not run, and `why`; if it was run and is legitimately empty, it prints `none`
+    instead. `trace` returns the items behind a number, or None; `dash` and `deviation` are the meanings of a dash and
+    of ±; `lead` is a sentence after the title.
     """
 
     name: str
@@ -170,7 +170,7 @@ class PrintedTable:
 
     @cached_property
     def marked(self) -> set[Column]:
-        """The columns in which some number has a mark; their other cells leave space for one."""
+        """The columns with a mark on some number; their other cells leave space for one."""
         return {column for column in self.columns if any(column.parts(row)[2] for row in self.records)}
 
     @property
@@ -180,7 +180,7 @@ class PrintedTable:
 
     @property
     def remarks(self) -> list[str]:
-        """The notes, also with the meaning of ± and of a dash if the table has them."""
+        """The notes, with the meaning of ± and of a dash if the table has them."""
         cells = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
         dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in cells) else []
         spreads = [self.deviation] if any("±" in cell for cell in cells) else []
@@ -252,8 +252,11 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
 
 
 def table_latex(table: PrintedTable) -> str:
-    """Return a floating `table` environment with booktabs rules (`\\usepackage{booktabs}`), or for more than LONG rows
-    a `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes stand in the caption."""
+    """Return a floating `table` environment with booktabs rules (`\\usepackage{booktabs}`).
+
+    More than LONG rows become a `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes are in the
+    caption.
+    """
     import pandas as pd
 
     parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
@@ -272,8 +275,8 @@ def table_latex(table: PrintedTable) -> str:
     return str(text)
 
 
-def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = None) -> str:
-    """Return a table in a scrolling box, notes below, escaped. `address`: numbers link to the items behind them."""
+def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
+    """Return a table in a scrolling box with notes below, escaped. `address`: link numbers to the items behind them."""
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
         is_figure = column.is_number and figure not in ("", NONE)
@@ -285,7 +288,7 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
 
 @cache
 def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
-    """Return the Jinja2 environment of every page: all text is escaped, and an unknown name is an error."""
+    """Return the Jinja2 environment of every page, which escapes all text and raises an error for an unknown name."""
     import jinja2
 
     return jinja2.Environment(
@@ -316,12 +319,12 @@ _LATEX = str.maketrans(
 
 
 def latex(text: object) -> str:
-    """Return the text with all LaTeX special characters escaped; the symbols that our tables use become commands."""
+    """Return the text with all LaTeX special characters escaped; the symbols in our tables become commands."""
     return _latex(plain(text))
 
 
 def _latex(cell: str) -> str:
-    """Return `latex` of a cell as it is printed, which is plain already."""
+    """Return `latex` of a cell's printed text."""
     return cell.translate(_LATEX)
 
 
@@ -367,7 +370,7 @@ def new_figure(
 
 
 def freeze_layout(figure: Figure) -> None:
-    """Run the layout engine once and remove it, since it would move the elements differently on every save."""
+    """Run the layout engine once and remove it, since it would move the elements again on every save."""
     with figure_style():
         figure.draw_without_rendering()
         figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice

@@ -1,4 +1,4 @@
-"""The paper's analyses: from a tidy frame of cells to a tidy frame (docs/spec.md 5.4).
+"""The paper's analyses: tidy frame of cells in, tidy frame out (docs/spec.md 5.4).
 
 `cells` has one row per (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
 abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it from a study, `published.published_cells` from
@@ -42,8 +42,7 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
-    """Return cells of a study from its LEADERBOARD rows, with further columns: `_std` over runs, n_pairs, n_runs and so
-    on."""
+    """Return a study's cells from its LEADERBOARD rows, with further columns: `_std` over runs, n_pairs, n_runs etc."""
     rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
@@ -51,16 +50,16 @@ def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
 
 
 def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, with null deviations where there was only one run."""
+    """Return the rows, with deviations set to null where there was only one run."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 
 
 def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
-    """Return cells of the parts of datasets from METRICS rows, averaged over runs; the column `scope` names the part.
+    """Return cells by part of a dataset, from METRICS rows, averaged over runs.
 
-    scope is `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in
-    `study_cells`, with scope.
+    scope: `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in `study_cells`,
+    and `scope`, which names the part.
     """
     parts = metrics["scope"].str.partition(":")
     rows = metrics.assign(scope=parts[2]).loc[parts[0] == scope]
@@ -72,8 +71,7 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
 
 
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:
-    """Return ids of the registry's models in a group (main, replication, ..), of a family, or with an input (video,
-    image)."""
+    """Return the ids of the registry's models, filtered by group (main, replication, ..), family or input media."""
     criteria = {"group": group, "family": family, "input": media}
     return [
         entry.id
@@ -86,10 +84,10 @@ def models_of(group: str | None = None, family: str | None = None, media: str | 
 
 
 def overall(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs; PECS is averaged
-    too.
+    """Return equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs.
 
-    A (model, regime) that lacks one of the datasets in `cells` has no row, so that all rows average the same datasets.
+    PECS is averaged too, not recomputed from the means. A (model, regime) that lacks one of the datasets in `cells` has
+    no row, so that all rows average the same datasets.
     """
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
@@ -102,7 +100,7 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
 
     There is one row per model that has both regimes. means: a study's own `overall` rows, which leave out runs without
     all datasets; by default the means of `cells`. The ratio is infinite where standard is 0 and guided is not, and null
-    where one of them is null.
+    where either is null.
     """
     import pandas as pd
 
@@ -132,17 +130,16 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the models on the frontier in (Acc, J) after averaging over datasets: `frontier` of `overall`, with the
-    column j.
+    """Return the models on the frontier in (Acc, J) after averaging over datasets, with the column j.
 
-    It orders models and makes no ratio or gap, so epochs may differ.
+    This is `frontier` of `overall`. It orders models and computes no ratio or gap, so epochs may differ.
     """
     means = overall(cells)
     return frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
 
 
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that no other row of the same regime dominates in acc and j, by falling Acc.
+    """Return the rows that no other row of the same regime dominates in acc and j, by decreasing Acc.
 
     A model dominates another if it is at least as good in both figures and better in one. Two equal models are both on
     the frontier; a model without Acc or J is not on it.
@@ -156,7 +153,7 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
 
 
 def _dominated(points: pd.DataFrame) -> np.ndarray:
-    """Return which rows are dominated by another row in (acc, j): (rows,) bool."""
+    """Return which rows another row dominates in (acc, j): (rows,) bool."""
     at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
     no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
     better = (at[None] > at[:, None]).any(-1)
@@ -178,10 +175,10 @@ def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def degenerate_strategies() -> pd.DataFrame:
-    """Return expected figures of strategies that do not discriminate: strategy, acc, false_abs, abs_rec, j, pecs,
-    naive.
+    """Return expected figures of strategies that do not discriminate.
 
-    acc is null where the strategy does not determine it; PECS is still 0, since J is not above 0.
+    Columns strategy, acc, false_abs, abs_rec, j, pecs, naive. acc is null where the strategy does not determine it;
+    PECS is still 0, since J is not above 0.
     """
     import pandas as pd
 
@@ -205,14 +202,13 @@ def degenerate_strategies() -> pd.DataFrame:
 
 
 def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMIES) -> pd.DataFrame:
-    """Return textual over visual AbsRec: columns model, regime, taxonomy (occlusion, chaotic, pooled), visual, textual,
-    gap.
+    """Return textual over visual AbsRec: columns model, regime, taxonomy, visual, textual, gap.
 
-    Visual is the AbsRec on the taxonomy's own dataset, textual that on its ill-posed one. `pooled` is the mean of the
-    two textual values over the mean of the two visual ones, if both taxonomies are in `cells`. The gap is infinite
-    where visual is 0 and textual is not, and null where both are 0. Raises EpochMismatch where the two datasets of a
-    taxonomy are of different epochs, like the paper's own chaotic datasets, whose gaps it prints from an earlier epoch
-    (`visual_vs_textual.csv`).
+    taxonomy: occlusion, chaotic or pooled. Visual is the AbsRec on the taxonomy's own dataset, textual that on its
+    ill-posed one. `pooled` is the mean of the two textual values over the mean of the two visual ones, if both
+    taxonomies are in `cells`. The gap is infinite where visual is 0 and textual is not, and null where both are 0.
+    Raises EpochMismatch if the two datasets of a taxonomy are of different epochs, like the paper's own chaotic
+    datasets, whose gaps it prints from an earlier epoch (`visual_vs_textual.csv`).
     """
     import pandas as pd
 
@@ -238,8 +234,11 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
 
 
 def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the thinking member of each pair minus the other: columns thinking, other, regime, dataset, acc, abs_rec,
-    false_abs, pecs (differences of fractions). The cells may be of the dataset `overall` too."""
+    """Return the thinking member of each pair minus the other, by regime and dataset.
+
+    Columns thinking, other, regime, dataset, acc, abs_rec, false_abs, pecs (differences of fractions). The cells may
+    include the dataset `overall`.
+    """
     import pandas as pd
 
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
@@ -261,14 +260,14 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics,
-    "sub_scenario")`.
+    """Return means over models for every sub-scenario of the visual datasets.
 
-    Columns: dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec, pecs under standard, over n_models models; these
-    with the prefix guided_, over guided_n_models; abs_rec_uplift and false_abs_uplift (guided minus standard), over the
-    uplift_n_models that have both; abs_rec_ill_posed (standard) and textual_over_visual, over the ill_posed_n_models
-    that have both; n_missing, the missing items of all cells used. A model with a null figure is left out of the group
-    of means that needs it. A mean is null where its regime or dataset was not run.
+    cells: `scoped_cells(metrics, "sub_scenario")`. Columns: dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec,
+    pecs under standard, over n_models models; these with the prefix guided_, over guided_n_models; abs_rec_uplift and
+    false_abs_uplift (guided minus standard), over the uplift_n_models that have both; abs_rec_ill_posed (standard) and
+    textual_over_visual, over the ill_posed_n_models that have both; n_missing, the missing items of all cells used. A
+    model with a null figure is left out of the group of means that needs it. A mean is null if its regime or dataset
+    was not run.
     """
     import pandas as pd
 
@@ -299,10 +298,10 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_rec", "guided_abs_rec")) -> pd.DataFrame:
-    """Return unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`;
-    n_pairs and n_missing are sums, where table has them.
+    """Return unweighted means over the hidden sub-scenarios and over the others.
 
-    table has one row per occlusion sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
+    Columns kind, n, and `columns`; n_pairs and n_missing are sums, if table has them. table has one row per occlusion
+    sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
     """
     kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
     groups = table.groupby(kind)
@@ -311,10 +310,10 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
 
 
 def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return mean Acc under standard by the control's answer, over the models that have an Acc, from
-    `scoped_cells(metrics, "label")`.
+    """Return mean Acc under standard by the control's answer, over the models that have an Acc.
 
-    Columns dataset, sub_scenario, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
+    cells: `scoped_cells(metrics, "label")`. Columns dataset, sub_scenario, label, acc, n_pairs, n_models, n_missing
+    (items of both sides, over these models).
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""Published values that follow from other published values, recomputed and compared (`traps results audit`).
+"""Recompute published values from other published values, and compare (`traps results audit`).
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
 possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or
@@ -29,9 +29,8 @@ _AGREEING = (AGREES, ROUNDING)
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One published statement, the value that the published tables give for it, and the line of the paper's source
-    that it comes from."""
+class AuditFinding:
+    """A published statement, the value recomputed from the published tables, and its line in the paper's source."""
 
     group: str
     statement: str
@@ -44,7 +43,7 @@ class Finding:
 
 def audit() -> pd.DataFrame:
     """Return every finding: columns group, statement, published, recomputed, verdict, reason, line."""
-    groups: Sequence[Callable[[], Iterator[Finding]]] = (
+    groups: Sequence[Callable[[], Iterator[AuditFinding]]] = (
         claims,
         overall_means,
         pecs_factors,
@@ -61,8 +60,10 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return the findings for a terminal: every claim, every difference, and counts of the rest; with `everything`,
-    all."""
+    """Return the findings as text: every claim, every difference, and counts of the rest.
+
+    everything: list the rest, too.
+    """
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
@@ -78,7 +79,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def counts_text(findings: pd.DataFrame) -> str:
-    """Return how many statements agree, differ with a declaration, and disagree, as a sentence."""
+    """Return a sentence with the numbers of statements that agree, differ as declared, and differ."""
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
     agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
@@ -90,7 +91,7 @@ def counts_text(findings: pd.DataFrame) -> str:
 # --- claims.csv -------------------------------------------------------------------------------------------------------
 
 
-def claims() -> Iterator[Finding]:
+def claims() -> Iterator[AuditFinding]:
     """Yield every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
@@ -100,7 +101,7 @@ def claims() -> Iterator[Finding]:
         if verdict == DIFFERS and recomputed.agrees is None:
             reason = f"{_differences(printed, recomputed.words)}{'; ' + reason if reason else ''}"
         statement, line = f"{claim['id']}: {claim['statement']}", str(claim["line"])
-        yield Finding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
+        yield AuditFinding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
@@ -147,7 +148,7 @@ def _line(table: str) -> str:
 # --- tables against each other ----------------------------------------------------------------------------------------
 
 
-def overall_means() -> Iterator[Finding]:
+def overall_means() -> Iterator[AuditFinding]:
     """Yield the overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
     cells = published_cells()
     ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
@@ -166,15 +167,14 @@ def overall_means() -> Iterator[Finding]:
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
             name = f"overall {share} of {model}, {regime}"
             figures = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
-            yield Finding("overall", name, *figures, verdict, reason, _line("overall"))
+            yield AuditFinding("overall", name, *figures, verdict, reason, _line("overall"))
 
 
 _REPLICATION = models_of(group="replication")
 
 
-def pecs_factors() -> Iterator[Finding]:
-    """Yield PECS of every cell against its printed factors, within the range that averaging over runs and rounding
-    allow.
+def pecs_factors() -> Iterator[AuditFinding]:
+    """Yield PECS of every cell against its printed factors, within averaging and rounding errors.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
     deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
@@ -193,11 +193,11 @@ def pecs_factors() -> Iterator[Finding]:
         name = f"PECS of {cell['model']}, {cell['dataset']}, {cell['regime']}"
         figures = f"{shares['pecs']:.3f}", f"{naive:.4f}"
         group = "replication_per_dataset" if cell["model"] in _REPLICATION else "per_dataset"
-        yield Finding("pecs factors", name, *figures, verdict, "" if verdict == AGREES else reason, _line(group))
+        yield AuditFinding("pecs factors", name, *figures, verdict, "" if verdict == AGREES else reason, _line(group))
 
 
 def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
-    half = 0.0005  # of a printed 0.1 %
+    half = 0.0005  # half the last digit of a printed 0.1 %
     deviation = {name: float(cell[f"{name}_std"]) + half for name in ("acc", "abs_rec", "false_abs")}
     if not (cell["acc_std"] or cell["abs_rec_std"] or cell["false_abs_std"]):  # a single run has no deviation
         deviation = dict.fromkeys(deviation, 0.0)
@@ -209,7 +209,7 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
     return low, (shares["acc"] + half) * most + covariance
 
 
-def gaps() -> Iterator[Finding]:
+def gaps() -> Iterator[AuditFinding]:
     """Yield the printed gaps against the printed rates, each of which may have been rounded in its last digit."""
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
@@ -228,10 +228,10 @@ def gaps() -> Iterator[Finding]:
                 "" if agrees else f"{textual:g} / {visual:g} = {ours:.2f}; rounding allows {lowest:.2f}-{highest:.2f}"
             )
             name = f"textual over visual, {taxonomy}, {row['model']}"
-            yield Finding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason, _line("visual_textual"))
+            yield AuditFinding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason, _line("visual_textual"))
 
 
-def probe_means() -> Iterator[Finding]:
+def probe_means() -> Iterator[AuditFinding]:
     """Yield the printed four-path means against the means of the printed pairs, each rounded in its last digit."""
     columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
     for row in published_rows("probe_means"):
@@ -242,11 +242,11 @@ def probe_means() -> Iterator[Finding]:
             verdict: Verdict = AGREES if off <= 0.0005 + _SLACK else ROUNDING if off <= 0.001 + _SLACK else DIFFERS
             name = f"four-path mean AUROC, {items}, {row['model']}, {row['transfer_type']}"
             figures = f"{row[column]:.3f}", f"{mean:.5g}"
-            yield Finding("probe means", name, *figures, verdict, line=_line("probe_means"))
+            yield AuditFinding("probe means", name, *figures, verdict, line=_line("probe_means"))
 
 
-def transfer_types() -> Iterator[Finding]:
-    """Yield printed transfer types against the definitions."""
+def transfer_types() -> Iterator[AuditFinding]:
+    """Yield printed transfer types against their definitions."""
     for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
             ours, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
@@ -255,12 +255,15 @@ def transfer_types() -> Iterator[Finding]:
             )
             reason = "" if ours == printed else f"{row['source']} and {row['target']} share the taxonomy"
             verdict: Verdict = AGREES if ours == printed else DIFFERS
-            yield Finding("transfer types", where, printed, ours, verdict, reason, _line(table))
+            yield AuditFinding("transfer types", where, printed, ours, verdict, reason, _line(table))
 
 
-def steering_means() -> Iterator[Finding]:
-    """Yield the regime table of gemma-4-e4b against the means of its dose table, which the paper calls a verification
-    run with a smaller budget whose rates lie below. (Of qwen3-vl-8b the claims make the same comparison.)"""
+def steering_means() -> Iterator[AuditFinding]:
+    """Yield the regime table of gemma-4-e4b against the means of its dose table.
+
+    The paper calls the latter a verification run with a smaller budget and lower rates. (For qwen3-vl-8b the claims
+    make the same comparison.)
+    """
     prompts = {"direction_family": "all", "direction_regime": "standard", "inference_regime": "guided"}
     (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
     for side in ("control", "void"):
@@ -274,13 +277,13 @@ def steering_means() -> Iterator[Finding]:
             )
             reason = "" if same else f"lies {abs(ours - theirs):.3g} points {'below' if below else 'above'}, {where}"
             statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
-            yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
+            yield AuditFinding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
 
 
-def steering_families() -> Iterator[Finding]:
-    """Yield the regime table's figures over all paths against the means of its two source families, of four paths each.
+def steering_families() -> Iterator[AuditFinding]:
+    """Yield the regime table's figures over all paths against the means of its two source families of four paths.
 
-    The table does not say under which prompt the families' directions were read; the guided ones are assumed.
+    The table does not name the prompt of the families' directions; the guided ones are assumed.
     """
     rows = published("steering_regime").query("inference_regime == 'guided' and direction_regime != 'standard'")
     for model, group in rows.groupby("model", sort=False):
@@ -294,10 +297,12 @@ def steering_families() -> Iterator[Finding]:
             sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
-            yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes"))
+            yield AuditFinding(
+                "steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
+            )
 
 
-def validation_scores() -> Iterator[Finding]:
+def validation_scores() -> Iterator[AuditFinding]:
     """Yield F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last
     digit."""
     for row in published("judge_validation").to_dict("records"):
@@ -309,14 +314,14 @@ def validation_scores() -> Iterator[Finding]:
         verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
         reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
         figures = f"{printed:.2f}", f"{ours:.3f}"
-        yield Finding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
+        yield AuditFinding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
 
 
 def _f1(precision: float, recall: float) -> float:
     return 2 * precision * recall / (precision + recall)
 
 
-def composition_sums() -> Iterator[Finding]:
+def composition_sums() -> Iterator[AuditFinding]:
     """Yield category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
     counts: dict[str, int] = {}
     for row in published_rows("composition"):
@@ -325,14 +330,14 @@ def composition_sums() -> Iterator[Finding]:
         printed, ours = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
         verdict: Verdict = AGREES if ours == printed else DIFFERS
         shown = str(printed), str(ours)
-        yield Finding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
+        yield AuditFinding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
 
 
 # --- the text against itself ------------------------------------------------------------------------------------------
 
 
-def contradictions() -> Iterator[Finding]:
-    """Yield statements of the paper's text that another of its places contradicts, which no arithmetic decides."""
+def contradictions() -> Iterator[AuditFinding]:
+    """Yield statements that contradict another place of the paper's text, where no arithmetic decides."""
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
-        yield Finding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)
+        yield AuditFinding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

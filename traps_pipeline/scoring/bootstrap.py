@@ -1,14 +1,13 @@
-"""Resampled figures and their intervals: a Bayesian bootstrap over scenarios, one of them unseen (docs/scoring.md,
-"Intervals").
+"""Confidence intervals of scores by a Bayesian bootstrap over scenarios, with one unseen scenario.
 
-A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in every run, model and regime, stay
-together. All cells of a taxonomy share one weight matrix, so two entries' resamples are paired, and their difference is
-a paired difference (`contrasts`).
+See docs/scoring.md, "Intervals". A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in
+every run, model and regime, stay together. All cells of a taxonomy share one weight matrix, so two entries' resamples
+are paired, and their difference is a paired difference (`contrasts`).
 
-Every resample is computed twice, since scenarios that were not drawn may be unlike all those that were: once with one
-unseen scenario in each share that is the worst for the figure (its lower end), once with one that is the best (its
-upper end). For a share of n answers this is the interval of Clopper and Pearson; for a mean over scenarios it is the
-bound of Gaffke (2005). So an interval keeps a width where all answers agree, and with one scenario.
+Every resample is computed twice, since unsampled scenarios may differ from all sampled ones: once with one unseen
+scenario in each share that is the worst for the figure (its lower end), once with one that is the best (its upper end).
+For a share of n answers this is the interval of Clopper and Pearson; for a mean over scenarios it is the bound of
+Gaffke (2005). So an interval keeps a width even if all answers agree, and with a single scenario.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED for end in ("lo
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
 _LEVEL = 0.95
-_IN_MEAN = 0.5**0.5  # of two taxonomies: what happens in one says nothing of the other, so distances add up in squares
+_IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squared distances add up
 
 
 @dataclass(frozen=True)
-class Resampled:
-    """The mean over runs of every figure, and of its ends in every resample.
+class ResampledFigures:
+    """The mean over runs of every figure, observed and in every resample.
 
-    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64;
-    values: (entries, 2, RESAMPLED, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
-    for an `overall` entry without a run that has all four datasets.
+    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64; values:
+    (entries, 2, RESAMPLED, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and for an
+    `overall` entry without a run that has all four datasets.
     """
 
     entries: list[tuple[str, str, str]]
@@ -52,9 +51,11 @@ class Resampled:
         return self.values[:, :, RESAMPLED.index(name)]
 
 
-def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> Resampled:
-    """Resample every (model, regime) on each of its datasets, and overall: the equal-weight mean over the four
-    datasets, over the runs that have all four. Figures are computed per run, then averaged.
+def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledFigures:
+    """Resample every (model, regime) on each of its datasets, and overall.
+
+    Overall is the equal-weight mean over the four datasets, over the runs that have all four. Figures are computed per
+    run, then averaged.
 
     Memory: one float32 weight matrix (resamples, scenarios) per taxonomy, one (resamples, 6 x cells) product of a
     single model and regime, and the result: 400 kB per entry and figure at 10,000 resamples over four datasets.
@@ -73,12 +74,12 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
             observed.append(mean[1, :, 0])
             values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
     nothing = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
-    return Resampled(
+    return ResampledFigures(
         entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else nothing
     )
 
 
-def intervals(resampled: Resampled, level: float = _LEVEL) -> pd.DataFrame:
+def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFrame:
     """Return 95 % intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry; null where nothing is decided."""
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
@@ -90,7 +91,7 @@ def intervals(resampled: Resampled, level: float = _LEVEL) -> pd.DataFrame:
 
 
 def limits_of(figure: str) -> tuple[float, float]:
-    """Return the least and the greatest value of a figure: [-1, 1] for J, [0, 1] for all others."""
+    """Return the minimum and maximum of a figure: [-1, 1] for J, [0, 1] for all others."""
     return (-1.0, 1.0) if figure == "j" else (0.0, 1.0)
 
 
@@ -109,25 +110,29 @@ def interval(
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
-    """Return a figure and its interval as columns, from ends (2, 1 + resamples), the first of which were observed."""
+    """Return a figure and its interval as columns. ends: (2, 1 + resamples), the observed figure first."""
     low, high = interval(ends[:, 1:], ends[1, 0], limits)
     return {name: float(ends[1, 0]), f"{name}_ci_low": float(low), f"{name}_ci_high": float(high)}
 
 
 def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the ends of left - right from theirs, (.., 2, resamples) each: an unseen scenario may be the worst for one
-    and the best for the other."""
+    """Return the ends of left - right, (.., 2, resamples) each.
+
+    An unseen scenario may be the worst for one side and the best for the other.
+    """
     return left - right[..., ::-1, :]
 
 
 def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
-    """Return the central interval over the last axis without NaN: (.., resamples) -> (.., 2); NaN where all values are
-    NaN."""
+    """Return the central interval over the last axis, ignoring NaN: (.., resamples) -> (.., 2).
+
+    NaN where all values are NaN.
+    """
     return np.stack([quantile(draws, q) for q in ((1 - level) / 2, (1 + level) / 2)], axis=-1)
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
-    """Return a quantile over the last axis without NaN: (.., resamples) -> (..); NaN where all values are NaN."""
+    """Return a quantile over the last axis, ignoring NaN: (.., resamples) -> (..); NaN where all values are NaN."""
     flat = draws.reshape(-1, draws.shape[-1])
     is_complete = ~np.isnan(flat).any(axis=1)
     values = np.full(len(flat), np.nan)
@@ -140,8 +145,10 @@ def quantile(draws: np.ndarray, q: float) -> np.ndarray:
 
 
 def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> np.ndarray:
-    """Return how often each scenario is drawn in each resample: (resamples, scenarios) float32, rows sum to
-    `scenarios`."""
+    """Return how often each scenario is drawn in each resample: (resamples, scenarios) float32.
+
+    Each row sums to the number of scenarios.
+    """
     if not scenarios:
         return np.zeros((resamples, 0), np.float32)
     rng = np.random.default_rng(seed)
@@ -150,11 +157,10 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
 
 @dataclass(frozen=True)
 class Resampling:
-    """Weights of scenarios in every resample, after a first draw that takes each scenario once and no unseen one, and
-    so gives the figures themselves.
+    """Weights of scenarios in every resample.
 
-    scenarios: by taxonomy its scenarios (n,) and their weights (1 + resamples, n) float32: exponential with mean 1,
-    positive.
+    The first draw takes each scenario once and no unseen one, and so gives the figures themselves. scenarios: by
+    taxonomy its scenarios (n,) and their weights (1 + resamples, n) float32: exponential with mean 1, positive.
     """
 
     scenarios: Mapping[str, tuple[pd.Index, np.ndarray]]
@@ -162,8 +168,10 @@ class Resampling:
     seed: int
 
     def unseen(self, figures_of: str, decisions: int) -> np.ndarray:
-        """Return the weights of an unseen scenario for each decision of what is named, (decisions, 1 + resamples)
-        float64: the same for one name, unrelated for two."""
+        """Return weights of an unseen scenario for each decision, (decisions, 1 + resamples) float64.
+
+        They are the same for the same name, and independent for two names.
+        """
         rng = np.random.default_rng([self.seed, len(TAXONOMIES), crc32(figures_of.encode())])
         return np.concatenate([np.zeros((decisions, 1)), rng.standard_exponential((decisions, self.resamples))], axis=1)
 
@@ -180,9 +188,9 @@ def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return weighted sums of counts of every cell and resample: (cells, kinds, resamples).
+    """Return weighted sums of counts for every cell and resample: (cells, kinds, resamples).
 
-    weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of whole
+    weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of integer
     counts stay below 2^16, so float32 products are exact; weighted counts are summed in float64.
     """
     scenarios, cells, kinds = counts.shape
@@ -192,21 +200,21 @@ def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> np.ndarray:
-    """Return sums (.., 2 x decisions, draws) of how often each decision was yes and was made, followed by how often the
-    unseen scenario makes it: (.., 3 x decisions, draws).
+    """Append the unseen scenario's contribution to sums (.., 2 x decisions, draws): (.., 3 x decisions, draws).
 
-    That is as often as a scenario that has it does on average. scenarios: how many have it, (.., decisions); unseen:
-    weights of `Resampling.unseen`.
+    The sums count how often each decision was yes and was made. The unseen scenario makes it as often as an average
+    scenario that has it. scenarios: their number, (.., decisions); unseen: weights of `Resampling.unseen`.
     """
     size = sums[..., 1::2, 0] / np.maximum(scenarios, 1)
     return np.concatenate([sums, size[..., None] * unseen], axis=-2)
 
 
 def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return the lower and upper ends of shares from sums of `with_unseen`, of COUNTS those of Acc, FalseAbs and
-    AbsRec: (.., 3 x decisions, resamples) -> (2, .., decisions, resamples); NaN where a denominator is 0.
+    """Return the lower and upper ends of shares from sums of `with_unseen`.
 
-    in_mean: whether the shares enter a mean over datasets or arms, where the unseen scenarios weigh less (_IN_MEAN).
+    Of COUNTS these are Acc, FalseAbs and AbsRec: (.., 3 x decisions, resamples) -> (2, .., decisions, resamples); NaN
+    where a denominator is 0. in_mean: whether the shares enter a mean over datasets or arms, where the unseen scenarios
+    weigh less (_IN_MEAN).
     """
     decisions = sums.shape[-2] // 3
     yes, decided = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
@@ -216,8 +224,10 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
-    """Return the ends of the mean of values in [0, 1], one for each scenario of the index, (2, 1 + resamples). named:
-    as in `run_sums`."""
+    """Return the ends of the mean of values in [0, 1], one per scenario of the index: (2, 1 + resamples).
+
+    named: as in `run_sums`.
+    """
     sums = np.zeros((1, 2, 1 + resampling.resamples))
     for scenarios, weights in resampling.scenarios.values():
         own = values.reindex(scenarios)
@@ -227,15 +237,18 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples), as
-    `shares_of`.
+    """Return RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
+
+    in_mean: as in `shares_of`.
     """
     return figures_of_shares(shares_of(sums, in_mean))
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """Return RESAMPLED figures of the ends of Acc, FalseAbs and AbsRec: (2, .., 3, resamples) -> (2, .., RESAMPLED,
-    resamples)."""
+    """Return RESAMPLED figures from the ends of Acc, FalseAbs and AbsRec.
+
+    (2, .., 3, resamples) -> (2, .., RESAMPLED, resamples).
+    """
     acc, false_abs, abs_rec = np.moveaxis(shares, -2, 0)
     j = abs_rec - false_abs[::-1]
     return np.stack([acc, abs_rec, false_abs, j, ends_of_pecs(acc, j)], axis=-2)
@@ -251,9 +264,11 @@ def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tuple[str, int], np.ndarray]:
-    """Return (dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples), for the items of one model
-    and regime. A dataset (an arm) may have items of both taxonomies. named: what tells the items' unseen scenarios from
-    others'."""
+    """Return (dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples).
+
+    group: the items of one model and regime. A dataset (an arm) may have items of both taxonomies. named: identifies
+    the items' unseen scenarios.
+    """
     totals: dict[tuple[str, int], np.ndarray] = {}
     having: dict[tuple[str, int], np.ndarray] = {}
     for taxonomy, items in group.groupby("taxonomy", sort=True):
@@ -276,8 +291,10 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
 def means_over_runs(
     sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
-    """Return dataset or `overall` -> mean over runs (2, RESAMPLED, draws), from the `run_sums` of (dataset, run) and
-    the function (`figures_of`) that makes figures of them."""
+    """Return dataset or `overall` -> mean over runs (2, RESAMPLED, draws).
+
+    sums: the `run_sums` of (dataset, run). figures: the function (`figures_of`) that computes figures from them.
+    """
     runs = sorted({run for _, run in sums})
     means = {
         dataset: np.mean([figures(sums[dataset, run], False) for run in runs if (dataset, run) in sums], axis=0)

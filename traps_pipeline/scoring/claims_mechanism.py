@@ -18,9 +18,9 @@ DOSE_AGAINST_REGIME = (
 
 @dataclass(frozen=True)
 class Recomputed:
-    """A statement as recomputed, in the published wording, and the reason why it may differ.
+    """A recomputed statement in the published wording, and the reason why it may differ.
 
-    agrees: the verdict on a statement in words; None where the audit compares the numbers and names of both texts.
+    agrees: the verdict on a statement in words; None if the audit compares the numbers and names of both texts.
     """
 
     words: str
@@ -29,7 +29,7 @@ class Recomputed:
 
 
 def text_figure(name: str) -> float:
-    """Return a figure that stands in the paper's text alone, by its id in `other.csv`."""
+    """Return a figure that only the paper's text states, by its id in `other.csv`."""
     (row,) = published_rows("other", id=name)
     return float(row["value"])
 

@@ -2,7 +2,7 @@
 
 Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is a paired
 difference, in which the difficulty of the scenarios cancels. McNemar's test compares two regimes item by item. Answers
-to different items, or to one item in different epochs, are not compared (`epochs`): the row says why and holds no
+to different items, or to one item in different epochs, are not compared (`epochs`): the row gives the reason and no
 difference.
 """
 
@@ -23,13 +23,13 @@ from traps_pipeline.scoring.bootstrap import (
     ENTRY,
     RESAMPLED,
     RESAMPLES,
-    Resampled,
+    ResampledFigures,
     difference,
     interval,
     limits_of,
     resample,
 )
-from traps_pipeline.scoring.epochs import Origin, answered, refusal
+from traps_pipeline.scoring.epochs import Origin, answered_items, refusal
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, REGIME_TESTS
 from traps_pipeline.scoring.standings import means_over_runs, standings
@@ -42,15 +42,15 @@ _SIDES = ["left_model", "left_regime", "right_model", "right_regime"]
 _Side = tuple[str, str]  # model, regime
 
 
-def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return CONTRASTS rows from the bootstrap, the METRICS rows that it resamples (for their figures) and the VERDICTS
-    rows from which both are made (for their items and epochs).
+def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
+    """Return CONTRASTS rows from the bootstrap, and from the METRICS and VERDICTS rows behind it.
 
-    The rows compare every pair of models under each regime and every pair of regimes of each model, in PECS and in J,
-    on each dataset, and overall where both sides have a run of all four.
+    METRICS rows give the figures, VERDICTS rows the items and epochs. The rows compare every pair of models under each
+    regime and every pair of regimes of each model, in PECS and in J, on each dataset, and overall if both sides have a
+    run of all four.
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
-    items_of, sizes = answered(verdicts), _scenarios(verdicts)
+    items_of, sizes = answered_items(verdicts), _scenarios(verdicts)
     means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
     rows = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
@@ -71,21 +71,20 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
 
 
 def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """Return the change between two studies, such as two versions of the benchmark: now minus then, on their common
-    pairs.
+    """Return the change between two studies, such as two versions of the benchmark, on their common pairs.
 
-    then and now are VERDICTS rows; a pair that is not whole in both, in the same run and cell, is left out. Columns:
-    model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now, difference, ci_low,
-    ci_high, p, p_holm, separable, VERSION_SIDES with the suffixes _then and _now, and refused: why there is no
-    difference, where an item was answered in different epochs. Raises TrapsError where the two studies share no whole
-    pair.
+    The change is now minus then; both are VERDICTS rows. A pair that is incomplete in either study, in the same run and
+    cell, is left out. Columns: model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now,
+    difference, ci_low, ci_high, p, p_holm, separable, VERSION_SIDES with the suffixes _then and _now, and refused: the
+    reason for a missing difference, if an item was answered in different epochs. Raises TrapsError if the two studies
+    share no complete pair.
     """
     sides = _whole_pairs_of_both(then, now)
     if sides[0].empty:
         raise TrapsError("the two studies share no whole pair of the same model, regime and run")
     boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
     board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
-    asked, drawn = [answered(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
+    asked, drawn = [answered_items(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
     draws = [dict(zip(resampled.entries, resampled.values, strict=True)) for resampled in drawn]
     sizes = _scenarios(sides[1])
     rows = []
@@ -122,9 +121,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
 
 
 def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the rows of each study on the pairs (by model, regime and run) that have control and void in both
-    studies.
-    """
+    """Return each study's rows of the pairs (by model, regime and run) whose two sides are in both studies."""
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
     pairs = common.groupby(key).size()
@@ -169,7 +166,7 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
 def _decisions(
     verdicts: pd.DataFrame, column: str
 ) -> dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]]:
-    """Return the decisions in a column with their origins, by (dataset, model, run), regime and item.
+    """Return a column's decisions with their origins, by (dataset, model, run), regime and item.
 
     Undecided items are left out.
     """
@@ -184,7 +181,7 @@ def _decisions(
 
 
 def mcnemar_p(only_left: int, only_right: int) -> float:
-    """Return McNemar's exact two-sided p: whether items that differ between two sides differ to either as often."""
+    """Return McNemar's exact two-sided p from the numbers of items that differ in either direction."""
     differing = only_left + only_right
     tail = sum(comb(differing, k) for k in range(min(only_left, only_right) + 1))
     return min(1.0, 2 * tail / 2**differing)
@@ -213,8 +210,11 @@ def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, 
 
 
 def least_p(scenarios: int) -> float:
-    """Return the smallest two-sided p that paired differences of n scenarios can give, 2^(1 - n): that of a sign-flip
-    test whose differences all have one sign. Pairs of one scenario go together, so they count once."""
+    """Return the smallest two-sided p that paired differences of n scenarios can give, 2^(1 - n).
+
+    It is that of a sign-flip test whose differences all have one sign. Pairs of one scenario go together, so they count
+    once.
+    """
     return min(1.0, 2.0 ** (1 - scenarios))
 
 
@@ -228,7 +228,7 @@ def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
 def _difference(
     figure: str, sides: Sequence[np.ndarray], observed: Sequence[float], scenarios: int
 ) -> dict[str, float]:
-    """Return the columns of a paired difference of two sides over a number of scenarios: its interval and two-sided p.
+    """Return the columns of a paired difference over a number of scenarios: its interval and two-sided p.
 
     sides: the resampled ends of the left and the right, (2, resamples) each. If every resample is NaN, there is no p.
     """
@@ -248,7 +248,7 @@ def _beyond(ends: np.ndarray) -> float:
     """Return the share of ends at 0 or below, one added to their count.
 
     This is never below 1 / (resamples + 1), so no contrast of many models could be significant after Holm's correction.
-    Therefore, where no end lies there, it is the tail of a normal distribution with the mean and standard error of the
+    Therefore, if no end lies there, it is the tail of a normal distribution with the mean and standard error of the
     ends, if that is smaller.
     """
     beyond = int((ends <= 0).sum())
@@ -260,8 +260,10 @@ def _beyond(ends: np.ndarray) -> float:
 
 
 def _separable(table: pd.DataFrame, family: Sequence[str]) -> pd.Series:
-    """Return whether p_holm is below SEPARABLE_BELOW; null where no answers of so few scenarios could make the smallest
-    p of the family that small, and False where there is no p."""
+    """Return whether p_holm is below SEPARABLE_BELOW.
+
+    Null if so few scenarios cannot make the smallest p of the family that small, and False if there is no p.
+    """
     compared = table.groupby(list(family))["p"].transform("count").to_numpy(float)
     least = np.array([least_p(int(n)) if n == n else 0.0 for n in table["n_scenarios"].astype(float)])
     separable = pd.Series(table["p_holm"].astype(float) < SEPARABLE_BELOW, dtype="boolean")

@@ -1,8 +1,8 @@
-"""What the paper supposes and did not measure: how abstention changes when one thing of the pairs is changed step by
-step (docs/hypotheses.md).
+"""Test the paper's untested assumptions: how abstention changes as one property of the pairs changes step by step.
 
-Each hypothesis has doses, the first of which the others are compared with, on the scenarios that both have. Beside
-every figure of a model stands what the rules get, which read a cue and understand nothing, and what a guess is worth.
+See docs/hypotheses.md. Each hypothesis has doses; the first is the reference for the others, on the scenarios that both
+have. Beside every figure of a model stands the score of shortcut rules, which read one cue and understand nothing, and
+the score of a guess.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epoch
 from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
 
 VISUAL = ("occlusion", "chaotic")
-RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by one cue alone
+RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by a single cue
 SHOWN = ("acc", "false_abs", "abs_rec", "j")
-_SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # of `with_unseen`
+_SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # columns of `with_unseen`
 _CHANGE = (-2.0, 2.0)  # the limits of a change of J
 _KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
 
 @dataclass(frozen=True)
 class Dose:
-    """One step. datasets: that it is asked in, and of these one side or both. counts_as: what its items are."""
+    """One step. datasets: where it is asked; side: None for both. counts_as: the sides that its items count as."""
 
     name: str
     datasets: tuple[str, ...]
@@ -51,8 +51,7 @@ class Dose:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A hypothesis. figure: which is compared, J, or the share of abstentions whatever the side. doses: the first one
-    is the reference."""
+    """A hypothesis. figure: J, or the share of abstentions on any side. doses: the first one is the reference."""
 
     name: str
     figure: Literal["j", "abstains"]
@@ -120,11 +119,11 @@ DATASETS_READ = tuple(dict.fromkeys(name for one in HYPOTHESES for dose in one.d
 def hypotheses(
     verdicts: pd.DataFrame, offered: Mapping[str, int], resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return HYPOTHESES rows from the VERDICTS rows of DATASETS_READ: one for each model, regime, hypothesis and dose
-    of which a dose besides the reference was asked.
+    """Return HYPOTHESES rows from the VERDICTS rows of DATASETS_READ.
 
-    offered: how many answers each item's question has, by item id. Figures are computed per run, then averaged; their
-    intervals are of resampled scenarios, in which a scenario keeps all its doses.
+    There is one row per model, regime, hypothesis and dose, if a dose other than the reference was run. offered: the
+    number of answers to choose from in each item's question, by item id. Figures are computed per run, then averaged;
+    their intervals resample scenarios, each with all its doses.
     """
     items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
@@ -143,7 +142,7 @@ def hypotheses(
 
 
 def _in_pairs(hypothesis: Hypothesis) -> set[Dose]:
-    """Return doses that are sides of the pairs, which any study has."""
+    """Return the doses that are sides of the pairs, which every study has."""
     return {dose for dose in hypothesis.doses if set(dose.datasets) <= set(VISUAL)}
 
 
@@ -155,7 +154,7 @@ def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
 def _row(
     hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, resampling: Resampling
 ) -> dict[str, Any]:
-    """Return the columns of a dose's row, those of rules aside."""
+    """Return the columns of a dose's row, except those of rules."""
     model, regime = (items[name].iloc[0] for name in ("model", "regime"))
     named = f"{model}|{regime}|{hypothesis.name}"
     figures = _figures(items, resampling, f"{named}|{dose.name}")
@@ -200,8 +199,10 @@ def _row(
 
 
 def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return the ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws): of all items per
-    run, then the mean over runs."""
+    """Return the ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws).
+
+    They are computed over all items of a run, then averaged over runs.
+    """
     sums = run_sums(items.assign(dataset="all"), resampling, named)
     by_run = []
     for of_run in sums.values():
@@ -220,7 +221,7 @@ def _ends(name: str) -> list[str]:
 
 
 def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
-    """Return why a dose is not compared with its reference: other campaigns (docs/spec.md 9.2), panels or runs."""
+    """Return why a dose cannot be compared with its reference: other campaigns (docs/spec.md 9.2), panels or runs."""
     for what, column in (("epoch", "epoch"), ("panel", "panel")):
         own, other = (joined_epochs(some[column]) for some in (dose, reference))
         if own != other or "+" in own:
@@ -230,9 +231,11 @@ def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
 
 
 def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with what the rules get of the same hypothesis and dose: the highest value, and the largest
-    change, each with the rule that has it. A rule does not read the regime, so one of another regime serves where there
-    is none."""
+    """Return the rows with the rules' highest value and largest change for the same hypothesis and dose.
+
+    Each comes with the name of its rule. A rule does not read the regime, so rows of another regime serve if there are
+    none.
+    """
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
     remarks = []
     for row in rows.to_dict("records"):
@@ -243,16 +246,18 @@ def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str, Any]:
-    """Return the rule whose value is highest, or whose change is largest, either way."""
+    """Return the rule with the highest value, or with the largest absolute change."""
     known = [row for row in rows if row[field] is not None and row[field] == row[field]]
     best = max(known, key=lambda row: abs(row[field]) if field == "change" else row[field], default=None)
     return {named: best and best["model"], f"rule_{field}": best and best[field]}
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many rows break their definition: a share outside [0, 1], an interval out of order, a J that is not
-    AbsRec less FalseAbs, a change that is not the value less the reference's although all scenarios are compared. Null
-    is not wrong."""
+    """Return how many rows break their definition; null is not wrong.
+
+    A row is wrong if a share lies outside [0, 1], an interval is out of order, J is not AbsRec minus FalseAbs, or a
+    change over all scenarios is not the difference of the two values.
+    """
     wrong = np.zeros(len(table), bool)
     for name in (*SHOWN, "change"):
         figure, low, high = (table[column].to_numpy(float) for column in _ends(name))

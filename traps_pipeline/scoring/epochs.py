@@ -1,4 +1,4 @@
-"""Which figures may be compared: the rule of epochs (docs/spec.md 9.2), and that of panels."""
+"""Decide which figures may be compared: by the rule of epochs (docs/spec.md 9.2), and by panel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Origin(NamedTuple):
-    """Where a decision comes from: the campaigns of its answers and the panels of its votes, each joined by +."""
+    """The campaigns of a decision's answers and the panels of its votes, each joined by +."""
 
     epoch: str
     panel: str
@@ -31,7 +31,7 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
     """Raise EpochMismatch if any row of `epochs` holds two different epochs.
 
     epochs has one row per comparison (its index names it, e.g. model and dataset) and one column per side; a null side
-    is not compared. `what` names the figure in the message.
+    is ignored. `what` names the figure in the message.
     """
     mixed = epochs.loc[epochs.nunique(axis=1) > 1]
     if mixed.empty:
@@ -46,9 +46,11 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
     )
 
 
-def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """Return the items that every (model, regime, dataset) answered over its runs, with their origin; `overall` has the
-    runs with all four datasets, and is left out if there is none."""
+def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
+    """Return the items that each (model, regime, dataset) answered over its runs, with their origin.
+
+    `overall` covers the runs with all four datasets, and is left out if there is none.
+    """
     is_complete = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
     columns = ["model", "regime", "dataset", "item_id", "epoch", "panel"]
     origins: dict[tuple[str, str, str], dict[str, Origin]] = {}
@@ -64,8 +66,10 @@ def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
 
 
 def refusal(left: Answered, right: Answered) -> str | None:
-    """Return why two sides may not be compared item by item: their items differ, or an item's campaigns or panels do,
-    or panels are mixed; else None."""
+    """Return why two sides may not be compared item by item; None if they may.
+
+    Reasons: their items differ, an item's campaigns or panels differ, or panels are mixed.
+    """
     panels = [sorted({origin.panel for origin in side.values()}) for side in (left, right)]
     if left == right and all(len(names) < 2 and "+" not in "".join(names) for names in panels):
         return None
@@ -81,6 +85,6 @@ def refusal(left: Answered, right: Answered) -> str | None:
 
 
 def _named(items: list[str]) -> str:
-    """Return names the first of these items with its dataset, and counts the others."""
+    """Return the first of these items with its dataset, and the number of the others, in words."""
     dataset, more = items[0].partition(":")[0], len(items) - 1
     return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")

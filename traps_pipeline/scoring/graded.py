@@ -1,7 +1,7 @@
-"""Answers to graded cuts against the true distribution over answers (docs/scoring.md, "Graded cuts").
+"""Score answers to graded cuts against the true distribution over answers (docs/scoring.md, "Graded cuts").
 
-A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns nothing. What an answer is expected to
-earn follows from the posterior of its cut, so no figure here depends on which of the futures was filmed.
+A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns nothing. The expected points of an
+answer follow from the posterior of its cut, so no figure here depends on which of the futures was filmed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Resampling, draw_s
 from traps_pipeline.scoring.metrics import joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import GRADED_CUTS
 
-SCOPES = (0.0, 0.45, 0.6, ANSWER_FROM, 0.9)  # where ranges of the commonest answer's probability begin
-SUM_WITHIN = 0.05  # of 1, or stated probabilities are unread
+SCOPES = (0.0, 0.45, 0.6, ANSWER_FROM, 0.9)  # lower ends of ranges of the commonest answer's probability
+SUM_WITHIN = 0.05  # allowed deviation of a sum of probabilities from 1
 WITH_INTERVAL = {"points": (-WRONG_COSTS, 1.0), "regret": (0.0, 1.0 + WRONG_COSTS), "brier": (0.0, 2.0)}  # their limits
 PARTS = ("regret_label", "regret_rash", "regret_shy")
 _ANSWER = ["item_id", "model", "regime", "run"]
@@ -34,9 +34,11 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A graded item. posterior: the probability of each answer that any future ends in. commonest: the sub-scenario's
-    commonest answer."""
+class GradedItem:
+    """A graded item. posterior: the probability of each possible answer.
+
+    commonest: the sub-scenario's commonest answer.
+    """
 
     labels: Sequence[str]
     aliases: Mapping[str, str]
@@ -45,13 +47,16 @@ class Asked:
     posterior: Mapping[str, float]
 
     def label_of(self, value: str | None) -> str | None:
-        """Return the answer that a value names, as code decides correctness; None if it names none."""
+        """Return the answer that a value names, by the rules of correctness; None if it names none."""
         of = self.answer_type, self.labels, self.aliases
         return next((label for label in self.labels if is_correct(value, label, *of)), None)
 
     def read_probabilities(self, text: str | None) -> dict[str, float] | None:
-        """Return the probability that a text states for each answer: those of its object's `probabilities`, and what
-        is left to 1 evenly for the answers that it does not name. None if it states none, one twice, or a sum off 1."""
+        """Return the probability that a text states for each answer.
+
+        The text is a JSON object with `probabilities`; the rest to 1 is shared evenly among answers that it does not
+        name. None if it states none, names an answer twice, or sums to something else than 1.
+        """
         entries = (read_object(text or "") or {}).get("probabilities")
         stated = dict[str, float]()
         for entry in entries if isinstance(entries, list) else [None]:
@@ -71,9 +76,11 @@ class Asked:
         return {label: stated[label] / sum(stated.values()) for label in self.labels}
 
     def read_first_token(self, alternatives: object) -> dict[str, float] | None:
-        """Return the probability of each answer by the tokens that may begin it; None without log-probabilities. A
-        token counts for the answer that it names, else for the only one with a name that it begins; what counts for
-        none is shared evenly."""
+        """Return each answer's probability from the log-probabilities of the first token; None without them.
+
+        A token counts for the answer that it names, or for the only answer with a name that starts with it; the
+        remaining probability is shared evenly.
+        """
         if not isinstance(alternatives, str):
             return None
         names = {name.casefold(): label for name, label in self.aliases.items()}
@@ -94,11 +101,11 @@ def graded(
     verdicts: pd.DataFrame,
     votes: pd.DataFrame,
     responses: pd.DataFrame,
-    questions: Mapping[str, Asked],
+    questions: Mapping[str, GradedItem],
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> pd.DataFrame:
-    """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, which are given by id."""
+    """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, given by id."""
     labels, by_answer = _labels(votes, questions), responses.set_index(_ANSWER)
     texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
     rows = []
@@ -130,9 +137,12 @@ def _name(scope: int) -> str:
     return f"{SCOPES[scope]:g} to {[*SCOPES, 1.0][scope + 1]:g}"
 
 
-def _labels(votes: pd.DataFrame, questions: Mapping[str, Asked]) -> dict[tuple[Any, ...], str]:
-    """Return the answer of each response by more than half of its judges, "" for one that is none of the item's; no
-    entry without such a majority."""
+def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tuple[Any, ...], str]:
+    """Return the answer of each response by more than half of its judges, "" for an answer that the item does not
+    offer.
+
+    There is no entry without such a majority.
+    """
     cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
     chosen = dict[tuple[Any, ...], str]()
     for key, own in cast(Any, cast_votes.groupby(_ANSWER)):
@@ -146,16 +156,18 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, Asked]) -> dict[tuple[A
     return chosen
 
 
-def _of_verdict(item: Asked, abstained: object, label: str | None) -> dict[str, float]:
-    """Return what a decision of the panel comes to; nothing where it is undecided."""
+def _of_verdict(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
+    """Return the figures of a panel's decision; empty if it is undecided."""
     if pd.isna(cast(Any, abstained)) or (not abstained and label is None):
         return {}
     return decided(item, None if abstained else label)
 
 
-def _of_probabilities(item: Asked, stated: Mapping[str, float] | None) -> dict[str, float]:
-    """Return what stated probabilities come to; nothing where there are none. Who acts on them answers the largest,
-    and from ANSWER_FROM on."""
+def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the figures of stated probabilities; empty if there are none.
+
+    The policy that acts on them gives the most probable answer, if its probability is at least ANSWER_FROM.
+    """
     if stated is None:
         return {}
     likeliest = max(stated, key=lambda label: stated[label])
@@ -163,39 +175,44 @@ def _of_probabilities(item: Asked, stated: Mapping[str, float] | None) -> dict[s
     return acts | {"brier": brier(item.posterior, stated), "stated": stated[_commonest(item.posterior)]}
 
 
-def decided(item: Asked, label: str | None) -> dict[str, float]:
-    """Return the figures of one decision, an answer or an abstention (None): what it is expected to earn, and what an
-    ideal observer earns more, and why."""
+def decided(item: GradedItem, label: str | None) -> dict[str, float]:
+    """Return the figures of one answer, or of an abstention (None): its expected points and its regret.
+
+    The regret is the loss against an ideal observer, with its reasons.
+    """
     posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
     best, own = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
-    ideal, answers = max(0.0, earned(best)), label is not None
-    points = earned(own) if answers else 0.0
+    ideal, answers = max(0.0, expected_points(best)), label is not None
+    points = expected_points(own) if answers else 0.0
     return {
         "answers": float(answers),
         "wrong": 1 - own if answers else np.nan,
         "points": points,
         "regret": ideal - points,
-        "regret_label": earned(best) - earned(own) if answers else 0.0,
-        "regret_rash": ideal - earned(best) if answers else 0.0,
+        "regret_label": expected_points(best) - expected_points(own) if answers else 0.0,
+        "regret_rash": ideal - expected_points(best) if answers else 0.0,
         "regret_shy": 0.0 if answers else ideal,
-        "abstains_right": np.nan if earned(best) > 0 else float(not answers),
-        "abstains_wrong": float(not answers) if earned(best) > 0 else np.nan,
+        "abstains_right": np.nan if expected_points(best) > 0 else float(not answers),
+        "abstains_wrong": float(not answers) if expected_points(best) > 0 else np.nan,
         "brier_ideal": brier(posterior, posterior),
         "brier_even": brier(posterior, even),
         "points_ideal": ideal,
-        "points_best": earned(best),
-        "points_prior": earned(posterior.get(item.commonest, 0.0)),
+        "points_best": expected_points(best),
+        "points_prior": expected_points(posterior.get(item.commonest, 0.0)),
     }
 
 
-def earned(probability: float) -> float:
-    """Return the points that an answer is expected to earn which is right with some probability."""
+def expected_points(probability: float) -> float:
+    """Return the expected points of an answer that is right with this probability."""
     return probability - WRONG_COSTS * (1 - probability)
 
 
 def brier(posterior: Mapping[str, float], stated: Mapping[str, float]) -> float:
-    """Return the expected Brier score of stated probabilities, from 0 to 2: of each answer by its probability, the
-    squared distances of what is stated from 1 for it and from 0 for all others."""
+    """Return the expected Brier score of stated probabilities, from 0 to 2.
+
+    For each answer, weighted by its true probability, sum the squared distances of the stated probabilities from 1 for
+    that answer and from 0 for all others.
+    """
     apart = sum((stated.get(label, 0.0) - posterior.get(label, 0.0)) ** 2 for label in {*stated, *posterior})
     return apart + 1 - sum(p**2 for p in posterior.values())
 
@@ -205,7 +222,7 @@ def _commonest(posterior: Mapping[str, float]) -> str:
 
 
 def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, Any]:
-    """Return the figures of some items of a model and regime; a scenario counts once, with the mean over its runs."""
+    """Return the figures of a model's and regime's items; a scenario counts once, with the mean over its runs."""
     with_decision = items.loc[items["points"].notna()]
     of = with_decision.groupby("scenario_id")[_FIGURES].mean()
     row: dict[str, Any] = {
@@ -226,8 +243,11 @@ def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, A
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many GRADED_CUTS rows break their definition: a figure outside its limits or its interval, a regret
-    that is not the sum of its parts, or not what is missing to the ideal. Null is not wrong."""
+    """Return how many GRADED_CUTS rows break their definition; null is not wrong.
+
+    A row is wrong if a figure lies outside its limits or its interval, or if a regret is not the sum of its parts or
+    not the distance to the ideal.
+    """
     wrong = (table["regret"] - table[[*PARTS]].sum(axis=1)).abs().to_numpy(float) > _ROUNDING
     wrong |= (table["points"] + table["regret"] - table["points_ideal"]).abs().to_numpy(float) > _ROUNDING
     for name, (least, most) in WITH_INTERVAL.items():

@@ -1,4 +1,4 @@
-"""PECS without one judge: how much each judge of the panel influences it (docs/spec.md 4.1 and 5.1)."""
+"""PECS without one judge: the influence of each judge of the panel (docs/spec.md 4.1 and 5.1)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ _COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 def leave_one_out(
     verdicts: pd.DataFrame, votes: pd.DataFrame, board: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """Return LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made from
-    them.
+    """Return LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and their LEADERBOARD rows.
 
     PECS by the two other judges is computed as PECS by the panel: per run, then averaged; overall over the four
-    datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted. There are
-    none for a panel of one judge.
+    datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted. A panel of
+    one judge has no rows.
     """
     panel = board.rename(columns={"pecs": "pecs_panel", "n_missing": "n_missing_panel"})
     panel = panel.loc[:, [*ENTRY, "pecs_panel", "n_missing_panel"]]
@@ -42,8 +41,10 @@ def leave_one_out(
 def two_judge_verdicts(
     verdicts: pd.DataFrame, votes: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield each judge, and the VERDICTS rows that the two others give without it. They decide an item where both votes
-    are valid and agree; 1-1 is undecided. An item without an answer has no decision."""
+    """Yield each judge, and the VERDICTS rows that the other two judges give.
+
+    They decide an item if both votes are valid and agree; 1-1 is undecided. An item without an answer has no decision.
+    """
     cast = ratings(votes, judges)
     if len(cast.judges) < 2:
         return

@@ -21,7 +21,7 @@ BOUNDS = ["pecs_low", "pecs_high"]
 BROKEN = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN, "n_errors": ("error", "malformed")}
 COUNTED = [*OUTCOMES, "n_not_json"]
-REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of what not every panel is asked for: null where it is not
+REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of decisions that not every panel is asked for: null otherwise
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -65,10 +65,11 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
     in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
     fractions; a figure whose denominator is 0 is null, and so is every figure computed from it. `n_missing` counts the
-    items, of 2 n_pairs (of n_pairs where the dataset is an arm of one side), that lack a decision: abstained or correct
-    on a control, abstained on a void. BOUNDS show how far the missing decisions could move PECS; they are never null.
+    items, of 2 n_pairs (of n_pairs if the dataset is an arm of one side), that lack a decision: abstained or correct on
+    a control, abstained on a void. BOUNDS show how far the missing decisions could move PECS; they are never null.
     Every share has its n and its Wilson interval.
-    Raises ValueError when the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
+
+    Raises ValueError if the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
     """
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:
@@ -86,7 +87,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def mean(values: pd.Series) -> float:
-    """Return the mean; null where any value is null, so that no mean silently uses fewer values."""
+    """Return the mean; null if any value is null, so that no mean silently uses fewer values."""
     return float(np.mean(values.to_numpy(float)))
 
 
@@ -101,8 +102,7 @@ def joined_versions(versions: Iterable[str]) -> str:
 
 
 def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
-    """Return every verdict with its counts, once for each scope that it belongs to: ((1 + len(scoped_by)) x items)
-    rows."""
+    """Return every verdict with its counts once per scope: ((1 + len(scoped_by)) x items) rows."""
     import pandas as pd
 
     counts = decision_counts(verdicts)
@@ -137,11 +137,10 @@ def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return BOUNDS of every cell, (cells,) each: PECS of all pairs with every missing decision at its worst, and at
-    its best.
+    """Return BOUNDS of every cell, (cells,) each: PECS with every missing decision at its worst, and at its best.
 
     Each decision is bounded separately, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
-    FalseAbs, so that these two are its exact extremes. Where nothing is missing both equal PECS bit for bit.
+    FalseAbs, so that these two are its exact extremes. If nothing is missing both equal PECS bit for bit.
     """
     pairs = sums["n_pairs"].to_numpy(float)
     decided = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
@@ -155,8 +154,9 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's score interval of each share yes / of, (n,) each; 95 % by default. NaN where nothing was
-    decided.
+    """Return Wilson's score interval of each share yes / of, (n,) each; 95 % by default.
+
+    NaN where nothing was decided.
     """
     of = np.where(of > 0, of, np.nan)
     share, square = yes / of, z**2 / of
@@ -182,8 +182,11 @@ def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
 
 
 def wrong_figures(cells: pd.DataFrame) -> int:
-    """Return how many figures of METRICS rows break their definition: a share or bound outside [0, 1], a PECS that is
-    not Acc x max(0, J) or lies outside its bounds. Null figures (nothing decided) are not wrong."""
+    """Return how many figures of METRICS rows break their definition.
+
+    A figure is wrong if it is a share or bound outside [0, 1], or a PECS that is not Acc x max(0, J) or lies outside
+    its bounds. Null figures (nothing decided) are not wrong.
+    """
     acc, abs_rec, false_abs, pecs = (cells[name].to_numpy(float) for name in ("acc", "abs_rec", "false_abs", "pecs"))
     low, high = (cells[name].to_numpy(float) for name in BOUNDS)
     outside = sum(int(((share < 0) | (share > 1)).sum()) for share in (acc, abs_rec, false_abs, low, high))

@@ -1,9 +1,9 @@
-"""How precise a study will be before it is run: the width of PECS's interval, and the difference that can be found.
+"""Predict a study's precision: the width of PECS's interval, and the smallest detectable difference.
 
-Studies of a model are drawn, with answers that are independent of each other, and each is resampled as `bootstrap`
-does it, with its unseen scenarios. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall
-figure is the mean over datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy
-share their clips: where answers to them go together, intervals are wider than this.
+Simulated studies of a model have independent answers, and each is resampled as in `bootstrap`, with its unseen
+scenarios. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall figure is the mean over
+datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy share their clips: if
+answers to them are correlated, intervals are wider than predicted.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from traps_pipeline.scoring.bootstrap import RESAMPLED, TAXONOMIES, figures_of, 
 from traps_pipeline.scoring.contrasts import SEPARABLE_BELOW, least_p
 from traps_pipeline.scoring.metrics import pecs_of
 
-POWER, ROUNDS = 0.8, 2  # a better model varies otherwise: its difference is found in rounds
+POWER, ROUNDS = 0.8, 2  # a better model has another variance, so its difference is found iteratively
 STUDIES, RESAMPLES, SEED = 400, 400, 7  # 0.3 s; the width is off by less than 2 %
 
 
 @dataclass(frozen=True)
 class Shares:
-    """What a model is assumed to be: the shares of controls answered rightly and abstained on, and of voids abstained
-    on. Those of the default lie in the middle of the paper's models."""
+    """A model's assumed shares: controls answered correctly and abstained on, and voids abstained on.
+
+    The defaults lie in the middle of the paper's models.
+    """
 
     acc: float = 0.6
     abs_rec: float = 0.5
@@ -41,10 +43,13 @@ class Shares:
 
 @dataclass(frozen=True)
 class Precision:
-    """width: of the 95 % interval of PECS. difference: the smallest one between two models of unrelated answers that a
-    test at 5 % finds in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models, if
-    it is the first to be tested. Answers of the same items go together, which makes both smaller. None where not even
-    a difference of 1 is found so often."""
+    """The precision of a study.
+
+    width: of the 95 % interval of PECS. difference: the smallest one between two models with independent answers that a
+    test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models, if
+    it is tested first. Answers to the same items are correlated, which makes both smaller. None if not even a
+    difference of 1 is detected so often.
+    """
 
     width: float
     difference: float | None
@@ -52,8 +57,10 @@ class Precision:
 
 
 def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: int = 2) -> Precision:
-    """Return the precision of the mean over datasets with these numbers of pairs (those without a pair left out), in a
-    study of so many models. Raises ValueError where no dataset has a pair."""
+    """Return the precision of the mean over datasets with these numbers of pairs, in a study of several models.
+
+    Datasets without a pair are left out. Raises ValueError if no dataset has a pair.
+    """
     counts = [pairs.get(name, 0) for name in DATASETS if pairs.get(name, 0)]
     if not counts:
         raise ValueError("no dataset has a pair")
@@ -66,7 +73,7 @@ def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: in
 
 
 def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw studies of a model: the PECS of each, (STUDIES,), and its resampled ends, (STUDIES, 2, RESAMPLES)."""
+    """Simulate studies of a model: return the PECS of each, (STUDIES,), and its ends, (STUDIES, 2, RESAMPLES)."""
     rng, s = np.random.default_rng(seed), shares
     control, void = [s.acc, s.false_abs, max(0.0, 1 - s.acc - s.false_abs)], [s.abs_rec, 1 - s.abs_rec]
     observed, ends = np.zeros(STUDIES), np.zeros((STUDIES, 2, RESAMPLES))
@@ -80,7 +87,7 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
 
 
 def _better(shares: Shares, by: float) -> Shares:
-    """Return a model whose PECS is higher by so much: it abstains on more voids, then answers more controls rightly."""
+    """Return a model whose PECS is higher by `by`: it abstains on more voids, then answers more controls correctly."""
     goal = shares.pecs + by
     abs_rec = min(1.0, shares.false_abs + goal / shares.acc) if shares.acc else 1.0
     j = abs_rec - shares.false_abs
@@ -92,8 +99,10 @@ def _better(shares: Shares, by: float) -> Shares:
 def _detectable(
     counts: Sequence[int], shares: Shares, studies: tuple[np.ndarray, np.ndarray], scenarios: int, comparisons: int
 ) -> float | None:
-    """Return the difference of a better model from this one that is found in 80 % of studies at 5 % by the number of
-    comparisons: the lower end of the difference is then above 0."""
+    """Return the smallest difference of a better model that is detected in 80 % of studies.
+
+    Tests are at 5 % divided by the number of comparisons; a difference is detected if its lower end is above 0.
+    """
     if least_p(scenarios) * comparisons >= SEPARABLE_BELOW:
         return None
     smallest, (observed, ends) = 0.0, studies
@@ -106,8 +115,10 @@ def _detectable(
 
 
 def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
-    """Return the ends of PECS, (studies, 2, draws), of weighted numbers of pairs (studies, 6, draws): right, abstained,
-    wrong on the control, each with a void that was abstained on and with one that was not."""
+    """Return the ends of PECS, (studies, 2, draws), of weighted numbers of pairs (studies, 6, draws).
+
+    The six kinds of pairs: control right, abstained or wrong, each with a void that was abstained on or not.
+    """
     all_pairs = answers.sum(axis=1)
     yes = answers[:, :2].sum(axis=1), answers[:, 2:4].sum(axis=1), answers[:, ::2].sum(axis=1)
     sums = np.stack([part for own in yes for part in (own, all_pairs)], axis=1)

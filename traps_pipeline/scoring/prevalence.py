@@ -1,4 +1,4 @@
-"""How often each axis of confabulation applies to a model's void failures (docs/spec.md 6.2)."""
+"""Count how often each axis of confabulation applies to a model's void failures (docs/spec.md 6.2)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.scoring.metrics import joined_epochs, wilson
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE
 
-# Maps a column of CONFABULATION_PREVALENCE to the axes that must all apply.
+# Column of CONFABULATION_PREVALENCE to the axes that must all apply.
 SHARES: Mapping[str, tuple[str, ...]] = {
     "hp": AXES[:1],
     "ii": AXES[1:2],
@@ -23,8 +23,11 @@ SHARES: Mapping[str, tuple[str, ...]] = {
 
 
 def prevalence(labels: pd.DataFrame) -> pd.DataFrame:
-    """Return CONFABULATION_PREVALENCE rows from CONFABULATION rows: shares of validly labelled failures, with Wilson
-    intervals; null where a model has none. A model without a sampled failure has no row, since it was not run."""
+    """Return CONFABULATION_PREVALENCE rows from CONFABULATION rows.
+
+    They are shares of validly labelled failures, with Wilson intervals; null if a model has none. A model without a
+    sampled failure has no row, since it was not run.
+    """
     rows = [_row(str(model), group) for model, group in labels.groupby("model", sort=True)]
     return pd.DataFrame(rows, columns=pd.Index(CONFABULATION_PREVALENCE.names))
 

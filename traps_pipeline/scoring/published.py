@@ -17,10 +17,10 @@ _RENAMED = {"acc": "acc_pct", "abs_rec": "abs_rec_pct", "false_abs": "false_abs_
 
 
 def published(name: str) -> pd.DataFrame:
-    """Return one published file as numbers: percentages are percent, PECS and AUROC fractions
-    (`assets/published/README.md`).
+    """Return one published file as numbers (units: `assets/published/README.md`).
 
-    name is the file's stem, e.g. `probe_transfer`. Raises TrapsError that lists the files for another name.
+    Percentages are percent, PECS and AUROC fractions. name: the file's stem, e.g. `probe_transfer`. Raises TrapsError
+    that lists the files for another name.
     """
     return _read(name).copy()
 
@@ -34,13 +34,15 @@ def as_printed(name: str) -> pd.DataFrame:
 
 
 def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
-    """Return the rows of one published file as numbers and texts; where: values that the wanted rows have in these
-    columns."""
+    """Return rows of one published file as numbers and texts.
+
+    where: the required values of some columns.
+    """
     return [dict(row) for row in _records(name) if all(row[column] == value for column, value in where.items())]
 
 
 def published_digest() -> str:
-    """Return the digest of `assets/published`, from which the paper's tables and figures are made."""
+    """Return the digest of `assets/published`, the source of the paper's tables and figures."""
     files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
     return digest(files)[:16]
 

@@ -1,7 +1,7 @@
-"""What is left of PECS when abstaining must follow from clip and question together (docs/scoring.md, "Beyond PECS").
+"""PECS of abstention that follows from clip and question together (docs/scoring.md, "Beyond PECS").
 
-The conjunction asks, of each scenario, for everything at once. The robust figure is PECS over kinds: sets of items that
-are all answerable, or all void, for one reason. Arms whose outcome must be inferred enter neither.
+The conjunction requires every decision about a scenario to be right. The robust figure is PECS over kinds: sets of
+items that are all answerable, or all void, for one reason. Arms whose outcome must be inferred enter neither.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epoch
 from traps_pipeline.scoring.score_rows import ROBUST
 
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
-CONJUNCTION = ("control", "void", f"{TWIN} control", f"{CROSSED} control", f"{CROSSED} void")  # of one scenario
-FULL_KIND = 30  # items; a kind with fewer weighs less, in proportion
+CONJUNCTION = ("control", "void", f"{TWIN} control", f"{CROSSED} control", f"{CROSSED} void")  # items of one scenario
+FULL_KIND = 30  # items; a kind with fewer weighs proportionally less
 WITH_INTERVAL = ("robust", "conjunction")
 _ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
 
 def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """Return ROBUST rows from the VERDICTS rows of pairs and arms: one row per model and regime that has a run with all
-    four datasets and an arm.
+    """Return ROBUST rows from the VERDICTS rows of pairs and arms.
 
-    Figures are computed per run, then averaged; a figure that is null in one run is null. If runs have different arms,
-    the entry uses the runs with the most arms, all with the same ones (`arms`).
+    There is one row per model and regime that has a run with all four datasets and an arm. Figures are computed per
+    run, then averaged; a figure that is null in one run is null. If runs have different arms, the entry uses the runs
+    with the most arms, all with the same ones (`arms`).
     """
     items = pd.concat([verdicts[_ITEM], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
@@ -72,8 +72,10 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
 
 
 def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
-    """Return the runs of a model and regime that its entry uses, and the arms that each of them has: the largest set of
-    arms. Among sets of the same size it is the one that most runs have, then the first in the order of ARMS."""
+    """Return the runs of a model and regime that its entry uses, and the arms of each: the largest set of arms.
+
+    Among sets of the same size it is the one that most runs have, then the first in the order of ARMS.
+    """
     sets: dict[tuple[str, ...], list[int]] = {}
     for run, rows in group.groupby("run", sort=True):
         datasets = {*rows["dataset"]}
@@ -124,10 +126,10 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
 
 
 def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
-    """Return the ends of the robust figure of one run, (2, draws); NaN where it has no robust arm.
+    """Return the ends of the robust figure of one run, (2, draws); NaN if it has no robust arm.
 
-    cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: how many
-    each of them has.
+    cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: the number
+    of scenarios in each of them.
     """
     arms = {arm: min(1.0, scenarios[arm] / FULL_KIND) for arm in cells if arm in ROBUST_ARMS}
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
@@ -144,9 +146,9 @@ def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -
 
 
 def conjunction_of(items: pd.DataFrame) -> pd.Series:
-    """Return, of each scenario that is asked all of CONJUNCTION in one run, whether every decision is right (1 or 0).
+    """Return whether every decision about a scenario is right (1 or 0), for scenarios asked all of CONJUNCTION.
 
-    items: VERDICTS rows of one run with COUNTS. NaN where a decision was not made and none is wrong.
+    items: VERDICTS rows of one run with COUNTS. NaN if a decision is missing and none is wrong.
     """
     control, dataset = items["side"].eq("control"), items["dataset"]
     right = items["correct"].where(control, items["abs_rec"]).astype(float)
@@ -161,8 +163,10 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
 
 
 def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
-    """Return the ends of the share of decided scenarios that `conjunction_of` finds right, (2, draws), and their
-    number."""
+    """Return the ends of the share of decided scenarios that `conjunction_of` finds right, and their number.
+
+    The ends are (2, draws).
+    """
     decided = conjunction_of(items).dropna()
     return ends_of_mean(decided, resampling, named), len(decided)
 
@@ -175,8 +179,7 @@ def _missing(items: pd.DataFrame) -> int:
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Return why no figure joins pairs and arms: they were answered in different campaigns (docs/spec.md 9.2), or
-    judged by different panels."""
+    """Return why no figure may join pairs and arms: other campaigns (docs/spec.md 9.2), or other panels."""
     of_arms = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
         return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
@@ -187,8 +190,7 @@ def _refusal(items: pd.DataFrame) -> str | None:
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many ROBUST rows break their definition: a figure outside [0, 1] or outside its interval. Null is not
-    wrong."""
+    """Return how many ROBUST rows break their definition: a figure outside [0, 1] or its interval (null is right)."""
     shares = table[[*WITH_INTERVAL, "inference_acc", "inference_abstains"]].to_numpy(float)
     wrong = ((shares < 0) | (shares > 1)).any(axis=1)
     for name in WITH_INTERVAL:

@@ -29,20 +29,19 @@ _SUMMED = ["n_missing", "n_items", *COUNTED]
 
 
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """Return LEADERBOARD rows: `standings` with their `bootstrap.intervals` and the ranks that CONTRASTS rows leave
-    open."""
+    """Return LEADERBOARD rows: `standings` with their `bootstrap.intervals` and ranks from CONTRASTS rows."""
     board = standings(metrics).merge(intervals, on=ENTRY, how="left", validate="one_to_one")
     return board.join(_ranks(board, contrasts)).loc[:, LEADERBOARD.names]
 
 
 def standings(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are
-    ignored).
+    """Return every figure of the leaderboard except intervals and ranks, from METRICS rows of scope `all`.
 
-    Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
-    datasets within each run first; a run that lacks a dataset is left out of it, and a model and regime without a
-    complete run has no overall row. A figure that is null in one run is null here, so that every mean is over `n_runs`
-    runs. Items without a text count in no figure; where there are too many of them, the entry is `incomplete`.
+    Rows of other scopes are ignored. Mean and population standard deviation (ddof 0) over runs. `overall` takes the
+    equal-weight mean over the four datasets within each run first; a run that lacks a dataset is left out of it, and a
+    model and regime without a complete run has no overall row. A figure that is null in one run is null here, so that
+    every mean is over `n_runs` runs. Items without a text count in no figure; if there are too many of them, the entry
+    is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
     means, deviations = (groups[CELL_FIGURES].agg(f) for f in (mean, _deviation))
@@ -63,7 +62,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return CELL_FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
+    """Return CELL_FIGURES of every entry as on the leaderboard, indexed by ENTRY, from METRICS rows."""
     return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[CELL_FIGURES].agg(mean))
 
 
@@ -75,8 +74,10 @@ def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return CELL and `pecs_by_family`: PECS of Acc, AbsRec and FalseAbs with families weighted equally. A family is
-    what the paper calls a sub-scenario."""
+    """Return CELL and `pecs_by_family`: PECS of Acc, AbsRec and FalseAbs with families weighted equally.
+
+    The paper calls a family a sub-scenario.
+    """
     families = metrics.loc[metrics["scope"].str.startswith("sub_scenario:")].groupby(CELL)
     shares = families[["acc", "abs_rec", "false_abs"]].agg(mean)
     pecs = pecs_of(shares["acc"].to_numpy(float), (shares["abs_rec"] - shares["false_abs"]).to_numpy(float))
@@ -97,7 +98,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _anywhere(wrong: pd.Series) -> pd.Series:
-    """Return what is wrong with entries, on the index ENTRY; with `overall` also where it is wrong with any dataset."""
+    """Return flags of entries, on the index ENTRY; those of `overall` are set if any dataset's is."""
     anywhere = cast(pd.Series, wrong.groupby(level=["model", "regime"]).transform("any")).astype(bool)
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
@@ -107,8 +108,10 @@ def _deviation(values: pd.Series) -> float:
 
 
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """Return rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there
-    is no PECS, and where the row is of several panels."""
+    """Return rank, rank_low and rank_high of every row among those of its panel, on `board`'s index.
+
+    Null without PECS, and if the row is of several panels.
+    """
     known = contrasts["separable"].astype("boolean").fillna(False)
     separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & known]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
@@ -128,8 +131,9 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
-    """Return how many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]); null is not
-    wrong.
+    """Return how many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]).
+
+    Null is not wrong.
     """
     wrong = 0
     for figure in RESAMPLED:

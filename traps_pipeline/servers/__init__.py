@@ -1,1 +1,1 @@
-"""Pages that listen on this machine: the review of scenarios, and labels by people."""
+"""Local web pages: the review of scenarios, and labels by people."""

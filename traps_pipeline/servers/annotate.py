@@ -1,7 +1,7 @@
-"""`traps people annotate`: people label clips and answers without knowing whose they are, one a screen.
+"""`traps people annotate`: people label clips and answers blindly, one per screen.
 
-The server alone knows what is shown. A browser gets a question, a clip or an answer, and a handle that is made for one
-person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.
+Only the server knows the identity of the shown unit. A browser gets a question, a clip or an answer, and a handle made
+for one person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from traps_pipeline.people.labels import LABELS
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.servers.labelstore import LabelStore, NotWaiting
-from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -41,7 +41,7 @@ TITLES: Mapping[TaskName, str] = {
 
 
 class Sent(BaseModel):
-    """A label from a browser; `label` is checked against the task's own model."""
+    """A label from a browser; `label` is validated by the task's own model."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     handle: str
@@ -49,14 +49,14 @@ class Sent(BaseModel):
 
 
 class Reopen(BaseModel):
-    """The wish to label the last unit of a task again."""
+    """A request to label the last unit of a task again."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     task: str
 
 
 class Annotation:
-    """A study whose clips and answers people label. What they are given is what the study held when this was made."""
+    """A study whose clips and answers people label, as it was when this object was created."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
@@ -67,7 +67,7 @@ class Annotation:
 
     def _sample(self, task: TaskName) -> pd.DataFrame:
         units_drawn = sample(self.workspace, task)
-        if task == "answerability":  # a clip that was not copied with the study cannot be shown
+        if task == "answerability":  # leave out clips that were not copied with the study
             has_clip = [self.workspace.resolve(self.items[item]["clip"]).is_file() for item in units_drawn["item_id"]]
             units_drawn = units_drawn.loc[has_clip]
         return units_drawn.set_index("unit", drop=False)
@@ -80,27 +80,30 @@ class Annotation:
 
     @cached_property
     def fps(self) -> dict[str, int]:
-        """Frames a second by clip."""
+        """Frames per second of each clip."""
         rows = self.workspace.tables.read_all(VIDEOS, ["path", "fps"])
         return {str(path): int(fps) for path, fps in zip(rows["path"], rows["fps"], strict=True)}
 
     @cached_property
     def failures(self) -> dict[str, dict[str, str]]:
-        """What the task `confabulation` shows, by unit."""
+        """The content that the task `confabulation` shows, by unit."""
         return {row["sample_id"]: row for row in sheet_rows(self.workspace)}
 
     def progress(self, who: str, task: TaskName) -> tuple[int, int]:
-        """Return how many units a person has labelled, and how many there are for them."""
+        """Return the number of units that a person has labelled, and the number of units for them."""
         own = self.samples[task]
         return sum(unit in own.index for unit in self.store.labelled(who, task)), len(own)
 
     def next_unit(self, who: str, task: TaskName) -> str | None:
-        """Return the unit that a person labels next, which they are now shown: the one that waits, else the first of
-        their queue. None where all are labelled, or those left are of scenarios that they met in this sitting."""
+        """Return a person's next unit, and record it as shown.
+
+        It is the unit that waits for a label, else the first of their queue. None if all are labelled, or if the rest
+        belong to scenarios that they met in this sitting.
+        """
         own, seen = self.samples[task], self.store.shown(who)
         waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
-        met = {each.scenario_id for each in seen if each.at > since}  # in any task: answers tell about clips
+        met = {each.scenario_id for each in seen if each.at > since}  # in any task, since answers reveal clips
         done = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
         open_units = (
@@ -114,15 +117,15 @@ class Annotation:
         return unit
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
-        """Return the task and unit of a handle that this person was given. Raises NotThere."""
+        """Return the task and unit of a handle that was given to this person. Raises NotFound."""
         for each in self.store.shown(who):
             task = require_task(each.task)
             if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
                 return task, each.unit
-        raise NotThere("nothing of this name is shown to you")
+        raise NotFound("nothing of this name is shown to you")
 
     def record(self, who: str, sent: Sent) -> None:
-        """Keep a label. Raises NotThere, Refused and Conflict."""
+        """Store a label. Raises NotFound, Refused and Conflict."""
         task, unit = self.find(who, sent.handle)
         try:
             label = LABELS[task].model_validate(sent.label)
@@ -134,22 +137,22 @@ class Annotation:
             raise Conflict(str(error)) from error
 
     def reopen(self, who: str, name: str) -> None:
-        """Show the last labelled unit of a task again. Raises NotThere without one."""
+        """Show the last labelled unit of a task again. Raises NotFound without one."""
         task = require_task(name)
         known = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
         if not known:
-            raise NotThere("you have labelled nothing here yet")
+            raise NotFound("you have labelled nothing here yet")
         self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
-        """Return the clip behind a handle. Raises NotThere."""
+        """Return the clip behind a handle. Raises NotFound."""
         task, unit = self.find(who, handle)
         if task != "answerability":
-            raise NotThere("nothing of this name is shown to you")
+            raise NotFound("nothing of this name is shown to you")
         return study_file(self.workspace, self.items[str(self.samples[task].loc[unit, "item_id"])]["clip"])
 
     def shown(self, who: str, task: TaskName, unit: str) -> dict[str, Any]:
-        """Return all that a browser gets of a unit."""
+        """Return everything that a browser gets of a unit."""
         row = self.samples[task].loc[unit]
         handle = self.store.handle(who, task, unit)
         if task == "confabulation":
@@ -169,11 +172,11 @@ class Annotation:
     # --- pages --------------------------------------------------------------------------------------------------------
 
     def start_page(self, who: str) -> str:
-        """Return the page on which a person chooses a task."""
+        """Return the page with a person's choice of tasks."""
         return page("annotate_start.html.j2", who=who, tasks=self._tasks(who))
 
     def unit_page(self, who: str, task: TaskName) -> str:
-        """Return the page of the next unit, or the one that says why there is none now."""
+        """Return the page of the next unit, or one that says why there is none now."""
         unit = self.next_unit(who, task)
         done, total = self.progress(who, task)
         about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": done}
@@ -183,12 +186,12 @@ class Annotation:
         return page("annotate.html.j2", **about, total=total, shown=self.shown(who, task, unit))
 
     def _tasks(self, who: str) -> dict[TaskName, tuple[str, int, int]]:
-        """Return title, labelled and all units of each task."""
+        """Return title, labelled and total units of each task."""
         return {task: (title, *self.progress(who, task)) for task, title in TITLES.items()}
 
 
 def annotation_app(annotation: Annotation) -> FastAPI:
-    """Return the app of the labelling pages; the guard before it says who asks."""
+    """Return the app of the labelling pages; the guard before it identifies the person."""
     app = new_app()
 
     def who(request: Request) -> str:
@@ -201,12 +204,12 @@ def annotation_app(annotation: Annotation) -> FastAPI:
     @app.get("/task/{name}")
     def unit(request: Request, name: str) -> Response:
         if name not in TASKS:
-            raise NotThere(f"{name}: no task of this name")
+            raise NotFound(f"{name}: no task of this name")
         return HTMLResponse(annotation.unit_page(who(request), require_task(name)))
 
     @app.get("/clip/{handle}")
     def clip(request: Request, handle: str) -> Response:
-        # Not as a file: its times and name would be sent along.
+        # Not as a file response, which would send its times and name.
         return Response(annotation.clip(who(request), handle).read_bytes(), media_type="video/mp4")
 
     @app.get("/annotate.js")

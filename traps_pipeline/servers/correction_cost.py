@@ -1,4 +1,4 @@
-"""What a correction would make asked again: items, calls and dollars, before anybody decides."""
+"""Preview the cost of a correction before it is decided: items, calls and dollars to ask again."""
 
 from __future__ import annotations
 
@@ -22,10 +22,13 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 @dataclass
-class Touched:
-    """What corrections touch: items by id, how many answers and votes are asked again at most (the ledger may know
-    some), dollars of calls over the network (None where a price is unknown), scenarios whose clips are rendered again,
-    scenarios that left and that are new, and the question after the correction."""
+class CorrectionEffect:
+    """The effect of corrections.
+
+    Items by id, the maximum number of answers and votes to ask again (the ledger may know some), dollars of calls over
+    the network (None if a price is unknown), scenarios to render again, removed and new scenarios, and the corrected
+    question.
+    """
 
     items: list[str] = field(default_factory=list)
     answers: int = 0
@@ -36,10 +39,10 @@ class Touched:
     added: list[str] = field(default_factory=list)
     question: str = ""
 
-    def plus(self, other: Touched) -> Touched:
-        """Return both together."""
+    def plus(self, other: CorrectionEffect) -> CorrectionEffect:
+        """Return the sum of both."""
         known = self.dollars is not None and other.dollars is not None
-        return Touched(
+        return CorrectionEffect(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
             (self.dollars or 0) + (other.dollars or 0) if known else None,
             self.rendered + other.rendered, self.gone + other.gone, self.added + other.added,
@@ -53,8 +56,8 @@ class Touched:
         return cost_text + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
 
 
-def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
-    """Return what a correction touches of a SCENE_SPECS row. Raises TrapsError for parameters that are refused."""
+def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> CorrectionEffect:
+    """Return the effect of a correction on a SCENE_SPECS row. Raises TrapsError for refused parameters."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:
@@ -65,7 +68,7 @@ def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correctio
     ill_posed = changes.get("ill_posed_question", spec["ill_posed_question"]) != spec["ill_posed_question"]
     judged_again = changes.get("answer", spec["ground_truth"]) != spec["ground_truth"] or "labels" in changes
     seats = len(load_panel(workspace.study.panel))
-    cost = Touched(question=question, rendered=[spec["scenario_id"]] if renders else [])
+    cost = CorrectionEffect(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _asked(workspace, spec["taxonomy"]):
         for side in SIDES:
             of_ill_posed = is_ill_posed(dataset) and side == "void"
@@ -88,7 +91,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 
 def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
-    """Yield model, dataset of the taxonomy, and how many evaluations the study's experiments ask of it."""
+    """Yield model, dataset of the taxonomy, and the number of evaluations that the study's experiments want."""
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)

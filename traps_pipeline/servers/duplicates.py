@@ -1,4 +1,4 @@
-"""Near duplicates: scenarios of a family whose control clips look alike."""
+"""Find near duplicates: scenarios of a family whose control clips look alike."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 
 from traps_pipeline.video.encode import DamagedClip, decode
 
-PLACES = (0.0, 0.5, 1.0)  # of the frames that are compared, as shares of the clip
+PLACES = (0.0, 0.5, 1.0)  # positions of the compared frames, as shares of the clip
 SIDE = 16  # a frame gives SIDE x SIDE bits: whether a pixel of the reduced frame is brighter than the one on its left
-ALIKE_BELOW = 0.1  # share of differing bits below which two scenarios are worth a look
+ALIKE_BELOW = 0.1  # share of differing bits below which two scenarios are near duplicates
 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """The scenario that looks most alike, and the share of bits in which the two differ."""
+    """The most similar scenario, and the share of differing bits."""
 
     scenario_id: str
     distance: float
@@ -38,7 +38,7 @@ def fingerprint(clip: Path) -> np.ndarray:
 
 
 def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
-    """Return the nearest scenario of the same family, for each that has one."""
+    """Return the nearest scenario of the same family, for each scenario that has one."""
     nearest_of = {}
     for family in sorted(set(families.values())):
         names = sorted(name for name in prints if families[name] == family)
@@ -54,8 +54,10 @@ def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) ->
 
 
 class Comparison:
-    """The neighbours of all scenarios, found in the background from the first time that they are asked for: decoding
-    700 clips takes a minute. clips: control clips by scenario; one that cannot be read is left out."""
+    """The neighbours of all scenarios, computed in the background on first use: decoding 700 clips takes a minute.
+
+    clips: control clips by scenario; unreadable ones are left out.
+    """
 
     def __init__(self, clips: Mapping[str, Path], families: Mapping[str, str]) -> None:
         self._clips, self._families = clips, families
@@ -64,7 +66,7 @@ class Comparison:
         self._lock, self._has_begun = threading.Lock(), False
 
     def start(self) -> None:
-        """Begin, unless it has begun."""
+        """Start the comparison, unless it has started."""
         with self._lock:
             if not self._has_begun:
                 self._has_begun = True
@@ -75,15 +77,15 @@ class Comparison:
             try:
                 self._prints[name] = fingerprint(clip)
             except DamagedClip:
-                continue  # the run that looks at it next names it
+                continue  # the next run reports it
         self._found = neighbours(self._prints, self._families)
 
     @property
     def progress(self) -> str:
-        """How far it is, in words; empty once it is done."""
+        """The progress in words; empty once it is done."""
         return "" if self._found is not None else f"{len(self._prints)} of {len(self._clips)} clips are compared"
 
     @property
     def found(self) -> Mapping[str, Neighbour]:
-        """The neighbours that look alike, once all are compared; empty until then."""
+        """The near duplicates, once all scenarios are compared; empty until then."""
         return {name: each for name, each in (self._found or {}).items() if each.distance < ALIKE_BELOW}

@@ -1,8 +1,8 @@
-"""Where `traps people annotate` keeps what people see and say: SQLite, and the append-only file that stages read.
+"""The store of `traps people annotate`: SQLite, and the append-only file that stages read.
 
-A label is committed, appended to `labels.jsonl` and brought to the disk before it is confirmed, so that a kill loses
-nothing that was. What a kill leaves between the two is appended when the store is next opened; labels of a file whose
-database is gone are taken over from it.
+A label is committed, appended to `labels.jsonl` and synced to disk before it is confirmed, so that a kill loses no
+confirmed label. A label that a kill leaves between the two steps is appended when the store is next opened; if the
+database is lost, labels are restored from the file.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
 from traps_pipeline.people.human_label_rows import LABELS_FILE
 from traps_pipeline.people.labels import label_lines
-from traps_pipeline.storage.lines import append_whole, checked_line
+from traps_pipeline.storage.lines import append_whole, line_with_checksum
 
 DATABASE = "labels.sqlite"
 HANDLE_DIGITS = 24
-_TAIL = 1 << 14  # bytes that hold the last label of the file
+_TAIL = 1 << 14  # bytes at the file's end that contain the last label
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS secrets (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS shown (
@@ -46,12 +46,12 @@ CREATE INDEX IF NOT EXISTS labels_of_a_person ON labels (who, task);
 
 
 class NotWaiting(TrapsError):
-    """A label of what does not wait for one: it was labelled before, in another window for instance."""
+    """The labelled unit waits for no label, for instance because it was labelled in another window."""
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A unit that a person was shown. at: seconds since 1970, when it was shown last; waits: it has no label yet."""
+class ShownUnit:
+    """A unit that was shown to a person. at: seconds since 1970, when it was last shown; waits: it has no label yet."""
 
     task: str
     unit: str
@@ -75,7 +75,7 @@ class LabelStore:
 
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
-        """Open a connection whose changes are committed, and on the disk, when the block ends without an error."""
+        """Open a connection whose changes are committed and synced when the block ends without an error."""
         try:
             with closing(sqlite3.connect(self.folder / DATABASE, timeout=30, isolation_level=None)) as database:
                 database.execute("PRAGMA synchronous=FULL")
@@ -90,20 +90,20 @@ class LabelStore:
             ) from error
 
     def handle(self, who: str, task: str, unit: str) -> str:
-        """Return the name of a unit in one person's browser: it reveals nothing, and is another's for others."""
+        """Return an opaque name of a unit for one person's browser, different for each person."""
         content = "\0".join((who, task, unit)).encode()
         return hmac.new(self._secret.encode(), content, "sha256").hexdigest()[:HANDLE_DIGITS]
 
-    def shown(self, who: str) -> list[Shown]:
-        """Return what a person was shown, in all tasks, the latest last."""
+    def shown(self, who: str) -> list[ShownUnit]:
+        """Return the units shown to a person, in all tasks, the latest last."""
         with self._database() as database:
             rows = database.execute(
                 "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
             ).fetchall()
-        return [Shown(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
+        return [ShownUnit(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
 
     def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:
-        """Note that a person is shown a unit now, and that it waits for a label."""
+        """Record that a unit is shown to a person now and waits for a label."""
         with self._database() as database:
             database.execute(
                 "INSERT INTO shown VALUES (?, ?, ?, ?, ?, 1) ON CONFLICT DO UPDATE SET at = excluded.at, waits = 1",
@@ -119,7 +119,7 @@ class LabelStore:
         return [unit for (unit,) in rows]
 
     def record(self, who: str, task: str, unit: str, label: Mapping[str, Any]) -> None:
-        """Keep a label. Raises NotWaiting where the person is not shown this unit, or has labelled it meanwhile."""
+        """Store a label. Raises NotWaiting if the unit is not shown to this person, or has been labelled meanwhile."""
         with self._database() as database:
             database.execute("BEGIN IMMEDIATE")
             row = database.execute(
@@ -138,7 +138,7 @@ class LabelStore:
         self._export()
 
     def _export(self, *, restore: bool = False) -> None:
-        """Append the labels that the file lacks. restore: first take those over that the database lacks."""
+        """Append the labels that the file lacks. restore: first import those that the database lacks."""
         path = self.folder / LABELS_FILE
         is_new = not path.exists()
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
@@ -152,7 +152,7 @@ class LabelStore:
                 rows = database.execute(f"SELECT {names} FROM labels WHERE seq > ? ORDER BY seq", (last,)).fetchall()
             records = [dict(zip(names.split(", "), row, strict=True)) for row in rows]
             append_whole(
-                descriptor, b"".join(checked_line(row | {"label": json.loads(row["label"])}) for row in records)
+                descriptor, b"".join(line_with_checksum(row | {"label": json.loads(row["label"])}) for row in records)
             )
             os.fsync(descriptor)
             if is_new:
@@ -161,7 +161,7 @@ class LabelStore:
             os.close(descriptor)
 
     def _restore(self, last: int) -> None:
-        """Take over the labels of the file that the database lacks: somebody moved the database away."""
+        """Import the labels that are only in the file, after the database was moved away."""
         with self._database() as database:
             (known,) = database.execute("SELECT coalesce(max(seq), 0) FROM labels").fetchone()
             if known >= last:
@@ -179,7 +179,7 @@ class LabelStore:
 
 
 def _last_seq(descriptor: int) -> int:
-    """Return the number of the last label in the file, 0 in an empty one; half a line that a crash left is cut off."""
+    """Return the number of the last label in the file, 0 in an empty one; truncate half a line left by a crash."""
     size = os.lseek(descriptor, 0, os.SEEK_END)
     from_ = max(0, size - _TAIL)
     tail = os.pread(descriptor, _TAIL, from_)

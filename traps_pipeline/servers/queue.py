@@ -1,4 +1,4 @@
-"""Which scenarios a reviewer is shown, and in which order."""
+"""The queues of a review: which scenarios are shown, and in which order."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ MEANINGS: Mapping[QueueName, str] = {
 
 
 def flags(workspace: Workspace) -> pd.DataFrame:
-    """Return by scenario how many judged answers have no unanimous panel (`judges`), and how evenly models are divided
-    on the controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
+    """Return by scenario the disagreement of judges and of models; empty without verdicts.
+
+    `judges`: the number of judged answers without a unanimous panel. `models`: p (1 - p), from 0 to 0.25, of the share
+    p of models that answer the controls correctly.
+    """
     rows = current_rows(workspace, VERDICTS, ["scenario_id", "item_id", "side", "n_valid", "correct", "unanimous"])
     judged = rows.loc[rows["n_valid"] > 0]
     split = (~judged["unanimous"].astype(bool)).groupby(judged["scenario_id"]).sum()
@@ -40,8 +43,10 @@ def queue(
     flagged: pd.DataFrame,
     alike: Mapping[str, float],
 ) -> list[str]:
-    """Return the scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. flagged:
-    `flags`; alike: by scenario, how far the one that looks most alike is."""
+    """Return the scenarios of a queue, in order. A reviewed scenario leaves every queue except `all`.
+
+    flagged: `flags`; alike: by scenario, the distance of its most similar one.
+    """
     if name == "all":
         return list(scenarios)
     waiting = [each for each in scenarios if each not in reviewed]

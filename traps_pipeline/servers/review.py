@@ -1,4 +1,4 @@
-"""`traps people review`: one scenario a screen, its clips in step, decisions appended to the corrections."""
+"""`traps people review`: one scenario per screen, its clips in step; decisions are appended to the corrections."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
 from traps_pipeline.report.explorer.scenario_words import answer_of_control, certificate_phrases, intervention
-from traps_pipeline.servers.correction_cost import Touched, touched
+from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
 from traps_pipeline.servers.duplicates import Comparison
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
-from traps_pipeline.servers.server import Conflict, NotThere, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -37,8 +37,10 @@ Record = Mapping[str, Any]
 
 
 class Decision(BaseModel):
-    """What a reviewer sends. seen: how many decisions about the scenario the page showed. `add` makes a new scenario of
-    the same family, with the parameters of this one and those of the changes."""
+    """A reviewer's decision. seen: the number of decisions about the scenario on the page.
+
+    `add` creates a new scenario of the same family, with this one's parameters and the changes.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
@@ -49,7 +51,7 @@ class Decision(BaseModel):
 
 
 class Undo(BaseModel):
-    """The wish to take back the last decision."""
+    """A request to take back the last decision."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
@@ -58,7 +60,7 @@ class Undo(BaseModel):
 
 
 class Preview(BaseModel):
-    """Changes whose cost a reviewer wants to know before they decide."""
+    """Changes whose cost a reviewer wants to see before deciding."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
@@ -87,12 +89,12 @@ class Review:
 
     @cached_property
     def flags(self) -> Any:
-        """`queue.flags` of the study as it was when the review began."""
+        """`queue.flags` of the study at the start of the review."""
         return flags(self.workspace)
 
     @cached_property
     def comparison(self) -> Comparison:
-        """Which control clips look alike; it begins when the queue of these is opened."""
+        """The comparison of control clips, started when the queue of near duplicates is opened."""
         differences = {
             id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
         }
@@ -101,20 +103,20 @@ class Review:
 
     @cached_property
     def observed(self) -> dict[str, str]:
-        """What the observer answered under the first regime that it was asked, by item."""
+        """The observer's answers under its first regime, by item."""
         rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
         own = rows.loc[rows["model"] == "observer"].sort_values(["item_id", "regime", "run"])
         first = own.dropna(subset=["text"]).drop_duplicates("item_id")
         return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
-        """Return the row of a scenario. Raises NotThere."""
+        """Return the row of a scenario. Raises NotFound."""
         if scenario_id not in self.specs:
-            raise NotThere(f"{scenario_id}: not a scenario of this study")
+            raise NotFound(f"{scenario_id}: not a scenario of this study")
         return self.specs[scenario_id]
 
     def reviewed(self) -> frozenset[str]:
-        """Return the scenarios about which a decision stands."""
+        """Return the scenarios with a valid decision."""
         last = {each.scenario_id: each for _, each in read_corrections()}
         return frozenset(id_ for id_, each in last.items() if is_reviewed([each]))
 
@@ -124,7 +126,7 @@ class Review:
         return queue(name, list(self.specs), self.reviewed(), self.flags, alike)
 
     def decide(self, sent: Decision) -> None:
-        """Append a decision. Raises NotThere, Refused and Conflict."""
+        """Append a decision. Raises NotFound, Refused and Conflict."""
         spec = self.spec(sent.scenario_id)
         correction, seen = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":
@@ -137,12 +139,12 @@ class Review:
             raise Conflict(str(error)) from error
 
     def _free_id(self, family: str) -> str:
-        """Return the first id from 9001 on that no scenario of the benchmark has or had."""
+        """Return the first id from 9001 on that no scenario has ever had."""
         used = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
         return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
 
     def undo(self, sent: Undo) -> None:
-        """Take back the last decision. Raises NotThere, Refused and Conflict."""
+        """Take back the last decision. Raises NotFound, Refused and Conflict."""
         self.spec(sent.scenario_id)
         try:
             undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
@@ -150,10 +152,10 @@ class Review:
             raise Conflict(str(error)) from error
 
     def preview(self, sent: Preview) -> dict[str, Any]:
-        """Return the words after the changes, and what asking again would take. Raises NotThere and Refused."""
+        """Return the words after the changes, and the cost of asking again. Raises NotFound and Refused."""
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
-        cost = touched(self.workspace, spec, correction)
+        cost = correction_effect(self.workspace, spec, correction)
         return {"question": cost.question, "cost": cost.sentence()}
 
     def _correction(self, scenario_id: str, action: str, changes: Mapping[str, Any], why: str) -> Correction:
@@ -166,10 +168,10 @@ class Review:
         except ValidationError as error:
             raise Refused(f"{scenario_id}: {explain(error)}") from error
 
-    def summary(self) -> Touched:
-        """Return what the decisions touch that the study's tables do not have yet."""
+    def summary(self) -> CorrectionEffect:
+        """Return the effect of the decisions that the study's tables do not contain yet."""
         scenarios = load_scenarios(self.workspace.study)
-        total = Touched(added=sorted({*scenarios} - {*self.specs}))
+        total = CorrectionEffect(added=sorted({*scenarios} - {*self.specs}))
         for scenario_id, spec in self.specs.items():
             scenario = scenarios.get(scenario_id)
             if scenario is None:
@@ -177,7 +179,7 @@ class Review:
             elif scenario.words or scenario.params is not None:
                 changes = dict(scenario.words) | ({"params": dict(scenario.params)} if scenario.params else {})
                 correction = self._correction(scenario_id, "correct", changes, "summary")
-                total = total.plus(touched(self.workspace, spec, correction))
+                total = total.plus(correction_effect(self.workspace, spec, correction))
         return total
 
     # --- pages --------------------------------------------------------------------------------------------------------
@@ -226,10 +228,10 @@ class Review:
         )
 
     def done_page(self, name: QueueName) -> str:
-        """Return the page at the end of a queue: what the decisions touch, and the commands that follow them."""
+        """Return the page at the end of a queue: the decisions' effect, and the commands that follow."""
         return page(
             "review_done.html.j2",
-            touched=self.summary(),
+            effect=self.summary(),
             queue=name,
             comparing=self.comparison.progress if name == "alike" else "",
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
@@ -240,13 +242,13 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """Return what shows and then asks what decisions touch, for ours or for an experiment's own file."""
+        """Return the commands that plan and run the changes, for our experiment or one from a file."""
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]
 
     def strip(self, scenario_id: str) -> bytes:
-        """Return frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
+        """Return frames of the control above the void's at the same times, as JPEG. Raises NotFound."""
         import cv2
 
         from traps_pipeline.video.encode import decode
@@ -265,10 +267,10 @@ class Review:
         return jpeg.tobytes()
 
     def clip(self, scenario_id: str, side: str) -> Path:
-        """Return the file of a clip. Raises NotThere where the study has none."""
+        """Return the file of a clip. Raises NotFound if the study has none."""
         row = self.clips.get((scenario_id, side))
         if row is None:
-            raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
+            raise NotFound(f"{scenario_id}: the study has no {side} clip of it")
         return study_file(self.workspace, row["path"])
 
 
@@ -277,7 +279,7 @@ def _as_json(value: Any) -> Any:
 
 
 def review_app(review: Review) -> FastAPI:
-    """Return the app of a review; it stands behind the guard."""
+    """Return the app of a review, to be placed behind the guard."""
     app = new_app()
 
     @app.get("/")

@@ -1,6 +1,6 @@
-"""What the pages that listen share: a FastAPI app behind the guard, its templates, errors as sentences, clips.
+"""Shared parts of local pages: a FastAPI app behind the guard, templates, errors as sentences, and clips.
 
-Nothing is served but what a study's tables name. The guard (`webguard`) lets in who has the token alone, and refuses
+Only files that a study's tables name are served. The guard (`webguard`) admits only holders of the token, and refuses
 foreign hosts, foreign origins and every change that is not a POST of JSON.
 """
 
@@ -28,25 +28,25 @@ from traps_pipeline.storage.workspace import Workspace
 WEB = Path(__file__).parent / "web"
 
 
-class NotThere(TrapsError):
-    """The study has nothing of this name: 404."""
+class NotFound(TrapsError):
+    """The study has nothing of this name (404)."""
 
 
 class Refused(TrapsError):
-    """What was sent cannot be taken: 400."""
+    """The request is invalid (400)."""
 
 
 class Conflict(TrapsError):
-    """Somebody else was faster: 409."""
+    """Another person was faster (409)."""
 
 
 def new_app() -> FastAPI:
-    """Return an app without documentation pages, in which a TrapsError becomes a sentence and a status."""
+    """Return an app without documentation pages that answers a TrapsError with a sentence and a status."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.exception_handler(TrapsError)
     async def said(request: Request, error: TrapsError) -> Response:
-        status = 404 if isinstance(error, NotThere) else 409 if isinstance(error, Conflict) else 400
+        status = 404 if isinstance(error, NotFound) else 409 if isinstance(error, Conflict) else 400
         return JSONResponse({"error": str(error)}, status)
 
     @app.exception_handler(RequestValidationError)
@@ -58,7 +58,7 @@ def new_app() -> FastAPI:
 
 
 def page(template: str, **values: Any) -> str:
-    """Return a page with the explorer's look. Its policy lets it load its own scripts, clips and pictures alone."""
+    """Return a page with the explorer's look. Its policy allows only its own scripts, clips and pictures."""
     style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return environment(WEB).get_template(template).render(style=style, style_digest=digest, **values)
@@ -66,27 +66,27 @@ def page(template: str, **values: Any) -> str:
 
 @cache
 def script(*names: str) -> str:
-    """Return sources of this room and of the explorer as one classic script, in a scope of their own."""
+    """Return sources of this room and of the explorer as one classic script with its own scope."""
     paths = [WEB / name if (WEB / name).is_file() else SHARED / name for name in names]
     sources = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
 
 
 def study_file(workspace: Workspace, relative: str) -> Path:
-    """Return a clip that a table of the study names. Raises NotThere where it is not among the study's clips."""
+    """Return a clip that a table of the study names. Raises NotFound for any other path."""
     path = workspace.resolve(relative)
     inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
     if not inside or not path.is_file():
-        raise NotThere("the study has no such clip")
+        raise NotFound("the study has no such clip")
     return path
 
 
 @dataclass(frozen=True)
 class Listening:
-    """Where a server listens, whom it lets in, and by which command it was started.
+    """A server's address, tokens and command.
 
-    tokens: one token, or the person that each of several belongs to. behind: the address of a server with HTTPS that
-    passes requests on, if there is one.
+    tokens: one token, or several tokens with the person of each. behind: the address of an HTTPS proxy in front, if
+    any.
     """
 
     host: str
@@ -96,7 +96,7 @@ class Listening:
     behind: str = ""
 
     def addresses(self) -> dict[str, str]:
-        """Return the address to open, by the person it is for ("" where there is one for all)."""
+        """Return the address to open, by person ("" if there is one for all)."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         base = self.behind.rstrip("/") or f"http://{host}:{self.port}"
         tokens = {self.tokens: ""} if isinstance(self.tokens, str) else self.tokens

@@ -1,1 +1,1 @@
-"""What is kept on disk: a workspace and its `study.yaml`, its tables, its ledger of paid calls, its prepared media."""
+"""A study on disk: its workspace and `study.yaml`, tables, ledger of paid calls, and prepared media."""

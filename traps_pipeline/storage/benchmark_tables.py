@@ -1,4 +1,4 @@
-"""The benchmark's tables: scenarios, their clips, the questions put to models; rows of what is still in them."""
+"""The benchmark's tables: scenarios, clips and items; and the rows that are still in the benchmark."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -143,7 +143,7 @@ def current_rows(
     columns: Sequence[str] | None = None,
     dataset: str | Sequence[str] = DATASETS,
 ) -> "pd.DataFrame":
-    """Return the rows of a table whose items are still in the benchmark; those of arms only where they are named.
+    """Return the rows of a table whose items are still in the benchmark; rows of arms only if `dataset` names them.
 
     Every count uses these: a cell that was evaluated before a correction may hold others.
     """

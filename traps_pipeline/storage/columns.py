@@ -1,4 +1,4 @@
-"""Columns that tables of several packages share: a type with its meaning in words, said once."""
+"""Column types that tables of several packages share, each with its meaning."""
 
 from dataclasses import dataclass
 from datetime import datetime

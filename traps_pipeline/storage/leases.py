@@ -1,6 +1,6 @@
-"""Pieces of a work that several processes share: each is leased by one of them, wherever the study's files lie.
+"""Leases on pieces of work that several processes share, wherever the study's files lie.
 
-A process that dies gives its pieces back, and the others make them.
+A lease expires with its process, and another process makes the piece.
 """
 
 from __future__ import annotations
@@ -16,18 +16,22 @@ POLL_S = 0.2
 
 @contextmanager
 def alone(store: Store, name: str) -> Iterator[None]:
-    """Hold a piece of work for the time of the block; a second process waits. Raises TrapsError where no lease can be
-    had."""
+    """Hold an exclusive lease on a piece of work within the block; a second process waits.
+
+    Raises TrapsError if no lease can be had.
+    """
     while (lease := store.lease(name)) is None:
         time.sleep(POLL_S)
     with closing(lease):
         yield
 
 
-def leased(store: Store, work: str, items: int, size: int) -> Generator[range]:
-    """Yield ranges of items, at most `size` each: first those that no other process has, then the others as they are
-    given back, finished or not. The lease of a range ends when the next one is asked for. Raises TrapsError where no
-    lease can be had."""
+def leased_ranges(store: Store, work: str, items: int, size: int) -> Generator[range]:
+    """Yield ranges of at most `size` items, each under a lease that ends when the next range is requested.
+
+    Ranges that no other process holds come first, then the others as they are released, finished or not. Raises
+    TrapsError if no lease can be had.
+    """
     leases = list[tuple[str, range]]()
     for first in range(0, items, size):
         name, chunk = f"{work}/{first:07d}", range(first, min(first + size, items))

@@ -1,5 +1,4 @@
-"""Lines of JSON that are appended, each with a checksum of its own: what a line says is believed only if it is what was
-written."""
+"""Append-only JSON Lines with a checksum per line, so that damaged lines are detected."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ _TAIL = len(_SUM) + 16 + len(b'"}\n')
 NOT_WHOLE = "not what was written"
 
 
-def checked_line(row: Mapping[str, Any]) -> bytes:
-    """Return a row (not empty) as a line, its checksum in it as the last field. Raises ValueError for NaN."""
+def line_with_checksum(row: Mapping[str, Any]) -> bytes:
+    """Return a non-empty row as a JSON line whose last field is its checksum. Raises ValueError for NaN."""
     body = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()[:-1]
     return body + _SUM + _sum_of(body) + b'"}\n'
 
@@ -28,14 +27,14 @@ def _sum_of(body: bytes) -> bytes:
 
 
 def is_whole(line: bytes) -> bool:
-    """Return whether a line is what `checked_line` made."""
+    """Return whether a line is undamaged output of `line_with_checksum`."""
     tail = line[-_TAIL:]
     return tail.startswith(_SUM) and tail.endswith(b'"}\n') and tail[len(_SUM) : -3] == _sum_of(line[:-_TAIL])
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a file, from 1. whole: whether it is what was written; torn: a last line that a crash cut off."""
+    """A line of a file, numbered from 1. whole: its checksum is right; torn: a last line that a crash cut off."""
 
     number: int
     content: bytes
@@ -44,7 +43,7 @@ class Line:
 
 
 def read_checked(path: Path) -> Iterator[Line]:
-    """Yield the lines of a file that `append_whole` and `checked_line` wrote, damaged ones too."""
+    """Yield the lines of a file that `append_whole` and `line_with_checksum` wrote, damaged ones included."""
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):  # the last one; that which lacks only its end, or has another one, is whole
@@ -55,7 +54,7 @@ def read_checked(path: Path) -> Iterator[Line]:
 
 
 def append_whole(descriptor: int, content: bytes) -> None:
-    """Append all of it, or nothing: half a line would swallow the next one. Raises OSError."""
+    """Append all of the content, or nothing: half a line would corrupt the next one. Raises OSError."""
     size, remaining = os.lseek(descriptor, 0, os.SEEK_END), content
     try:
         while remaining:

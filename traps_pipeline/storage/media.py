@@ -1,7 +1,7 @@
-"""What a model is shown of a clip: frames picked by time stamp, and the video or images that carry them.
+"""Prepare a clip for a model: pick frames by time stamp, and encode them as a video or images.
 
 The same decoded frames go to every backend. They are encoded once per clip and profile and shared over regimes and
-runs; the digest of what is sent goes into the ledger key.
+runs; the digest of the encoded bytes is part of the ledger key.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_bytes
-from traps_pipeline.storage.lines import NOT_WHOLE, checked_line, read_checked
+from traps_pipeline.storage.lines import NOT_WHOLE, line_with_checksum, read_checked
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.video.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.video.policies import FramePolicy
@@ -37,7 +37,7 @@ Profile = Literal["video", "images", "frames"]
 MOST = 25  # frames an API model sees, docs/spec.md 3.1
 JPEG_QUALITY = 92
 CACHE_BYTES = 256 * 2**20
-_REVISION = 1  # raise it when picking, resizing or the container changes: everything is then prepared anew
+_REVISION = 1  # raise it when picking, resizing or the container changes, so that all media are prepared anew
 _SUFFIX: dict[Profile, str] = {"video": ".mp4", "images": ".zip"}
 _MIME: dict[Profile, str] = {"video": "video/mp4", "images": "image/jpeg"}
 # What zipfile raises on an archive with altered bytes.
@@ -49,8 +49,8 @@ class MediaSpec(BaseModel):
 
     profile: an mp4, separate JPEGs, or raw frames for a local model. Frames are a grid of fps a second, at most `most`,
     or `uniform` evenly spaced ones. size: (width, height) in pixels to resize to. fit: a clip of another shape is
-    stretched to that size, or keeps its shape and is cropped on both sides. later: so many frames of the clip after
-    those frames are shown in their place.
+    stretched to that size, or keeps its shape and is cropped on both sides. later: shift the picked frames by this many
+    frames of the clip.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -63,8 +63,7 @@ class MediaSpec(BaseModel):
     later: int = Field(default=0, ge=0)
 
     def content(self) -> dict[str, Any]:
-        """Return the fields for a digest. One that came later counts only where it is used, so that what was made
-        before it keeps its digest."""
+        """Return the fields for a digest. Fields added later count only if set, so that older digests stay valid."""
         unused = {name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default}
         return self.model_dump(mode="json", exclude=unused)
 
@@ -103,11 +102,11 @@ class Frames:
 
 @dataclass(frozen=True)
 class Media:
-    """What is sent of a clip. path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` gives.
+    """A clip as it is sent. path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns.
 
-    sha256: of what is sent (the mp4; the JPEGs one after another; pixels and times), the same wherever the clip lies.
-    times_s: seconds into the clip. fps: at which the sent video plays; None but for profile video. size_bytes: of the
-    file; for frames of the pixels.
+    sha256: of the sent content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies.
+    times_s: seconds into the clip. fps: playing speed of a video; None for other profiles. size_bytes: of the file, or
+    of the pixels.
     """
 
     profile: Profile
@@ -123,23 +122,23 @@ class Media:
 
 
 def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
-    """Return indices of the frames that a model is shown, of a clip whose frames have these times (F,), s."""
+    """Return indices of the frames that a model is shown. times: (F,), seconds of the clip's frames."""
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
 def sample(clip: Path, spec: MediaSpec) -> Frames:
-    """Return the frames of a clip that a model sees. Raises DamagedClip."""
+    """Return a clip's frames as a model sees them. Raises DamagedClip."""
     frames, times = decode(clip)
     chosen = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(resized(frames[chosen], spec.size, spec.fit), times[chosen], clip_fps)
+    return Frames(resize(frames[chosen], spec.size, spec.fit), times[chosen], clip_fps)
 
 
-def resized(
-    frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch"
-) -> np.ndarray:
-    """Return frames (N, H, W, 3) uint8 at another width and height; as they are for None. With fit `crop` they keep
-    their shape: they are resized until they cover the size, and the middle of them is kept."""
+def resize(frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch") -> np.ndarray:
+    """Return frames (N, H, W, 3) uint8 at another width and height; unchanged if size is None.
+
+    With fit `crop` they keep their shape: they are resized until they cover the size, and their middle is kept.
+    """
     import cv2
 
     if size is None or size == (frames.shape[2], frames.shape[1]):
@@ -149,7 +148,7 @@ def resized(
         scale = max(size[0] / width, size[1] / height)
         covering = max(size[0], round(width * scale)), max(size[1], round(height * scale))
         left, top = (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2
-        return np.ascontiguousarray(resized(frames, covering)[:, top : top + size[1], left : left + size[0]])
+        return np.ascontiguousarray(resize(frames, covering)[:, top : top + size[1], left : left + size[0]])
     # Bit-exact, since the pixels are in the ledger key: other filters may differ between CPUs.
     return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_LINEAR_EXACT) for frame in frames])
 
@@ -158,18 +157,17 @@ def resized(
 
 
 class MediaStore:
-    """Prepared media under one folder, by clip and profile. Threads and processes may share it."""
+    """Prepared media under one folder, by clip and profile; safe for concurrent threads and processes."""
 
     def __init__(self, folder: Path, store: Store | None = None) -> None:
         self.folder, self._store = folder, store or FolderStore(folder)
-        self._sound: dict[Path, Media] = {}  # by note: what this process has prepared, or has checked byte by byte
+        self._sound: dict[Path, Media] = {}  # by note: media that this process has prepared or checked byte by byte
 
     def prepare(self, clip: Path, clip_digest: str, spec: MediaSpec) -> Media:
-        """Return what is sent of a clip, made once; a damaged or missing file is made anew. Blocks: call it in a
-        thread.
+        """Return a clip's media, prepared once; rebuild a damaged or missing file. Blocks: call it in a thread.
 
-        clip_digest: SHA-256 of the clip's file. Raises DamagedClip when the clip is not that or cannot be read,
-        TrapsError when nothing can be written, or when a video cannot play at the clip's own frame rate.
+        clip_digest: SHA-256 of the clip's file. Raises DamagedClip if the clip has another digest or is unreadable,
+        TrapsError if nothing can be written, or if a video cannot play at the clip's own frame rate.
         """
         note = self._note(clip_digest, spec)
         if note not in self._sound:
@@ -183,7 +181,7 @@ class MediaStore:
         return self._sound[note]
 
     def known(self, clip_digest: str, spec: MediaSpec) -> Media | None:
-        """Return what is sent of a clip if it is prepared, else None: a quick look at note and size, for planning."""
+        """Return a clip's media if they are prepared, else None. Checks only note and size, for planning."""
         note = self._note(clip_digest, spec)
         if note in self._sound:
             return self._sound[note]
@@ -195,7 +193,7 @@ class MediaStore:
         self._store.bring([note] if path is None else [note, path])
 
     def _here(self, clip_digest: str, spec: MediaSpec) -> Media | None:
-        """Return what lies on this machine."""
+        """Return the path of the media on this machine."""
         try:
             media = read_note(self._note(clip_digest, spec))
             return media if media.path is None or media.path.stat().st_size == media.size_bytes else None
@@ -203,12 +201,12 @@ class MediaStore:
             return None
 
     def _note(self, clip_digest: str, spec: MediaSpec) -> Path:
-        """Return the small JSON that says what is prepared; written after it, so that it vouches for it."""
+        """Return the path of the JSON note about the media; written last, so that it vouches for them."""
         return self.folder / clip_digest[:2] / f"{clip_digest}-{profile_digest(spec)[:16]}.json"
 
 
 def read_note(note: Path) -> Media:
-    """Return what a note says is prepared. Raises ValueError naming it where it is not what was written, or OSError."""
+    """Return the media that a note describes. Raises ValueError naming a damaged note, or OSError."""
     (line, *more) = [*read_checked(note)] or [None]
     if line is None or more or not line.whole:
         raise ValueError(f"{note}: {NOT_WHOLE}; delete it and run again: it is prepared anew")
@@ -218,7 +216,7 @@ def read_note(note: Path) -> Media:
 
 
 def profile_digest(spec: MediaSpec) -> str:
-    """Return the digest of all that decides the bytes of a profile, the clip aside."""
+    """Return the digest of everything that decides a profile's bytes, except the clip."""
     content: dict[str, Any] = {"revision": _REVISION, "spec": spec.content()}
     if spec.profile == "video":
         content["encoder"] = ENCODER
@@ -230,7 +228,7 @@ def profile_digest(spec: MediaSpec) -> str:
 def payload(media: Media) -> list[bytes]:
     """Return the bytes to send: of the mp4, or of each JPEG in order.
 
-    Raises DamagedClip when the file is not what was prepared, TrapsError for profile frames.
+    Raises DamagedClip if the file has changed, TrapsError for profile frames.
     """
     if media.path is None:
         raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
@@ -262,7 +260,7 @@ def _file(note: Path, profile: Profile) -> Path | None:
 
 
 def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
-    """Pick, encode, write the file, and last the note. The digest is of the bytes that were written."""
+    """Pick and encode frames, write the file, and last the note. The digest is of the written bytes."""
     _require(clip, clip_digest)
     sampled = sample(clip, spec)
     path, rate = _file(note, spec.profile), None
@@ -280,12 +278,12 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(sampled.times_s.tolist())
     media = Media(spec.profile, path, sha256, len(times), times, rate, size)
-    write_bytes(note, checked_line({name: value for name, value in asdict(media).items() if name != "path"}))
+    write_bytes(note, line_with_checksum({name: value for name, value in asdict(media).items() if name != "path"}))
     return media
 
 
 def _require(clip: Path, clip_digest: str) -> None:
-    """Raise DamagedClip unless the clip is the one that the prepared file will be filed under."""
+    """Raise DamagedClip unless the clip has the digest that the media will be stored under."""
     try:
         digest = file_digest(clip)
     except OSError as error:
@@ -298,7 +296,7 @@ def _require(clip: Path, clip_digest: str) -> None:
 
 
 def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
-    """Return frames a second at which the picked frames play: fps, or those of a slower clip."""
+    """Return the playing speed of the picked frames in frames a second: fps, or that of a slower clip."""
     rate = min(spec.fps or 1, sampled.clip_fps or np.inf)
     if rate != int(rate):
         raise TrapsError(
@@ -308,7 +306,7 @@ def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
 
 
 def _sha256(parts: Sequence[bytes]) -> str:
-    """Return SHA-256 of all parts, one after another."""
+    """Return the SHA-256 of all parts, one after another."""
     hasher = hashlib.sha256()
     for part in parts:
         hasher.update(part)
@@ -322,9 +320,7 @@ def _jpeg(frame: np.ndarray) -> bytes:
 
 
 def _zipped(jpegs: Sequence[bytes]) -> bytes:
-    """Return a zip of 00.jpg, 01.jpg, ..., uncompressed; the same images give the same bytes on every day and
-    system.
-    """
+    """Return an uncompressed zip of 00.jpg, 01.jpg, ...; the same images give the same bytes on every system."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for i, jpeg in enumerate(jpegs):
@@ -344,7 +340,7 @@ def _unzipped(data: bytes) -> list[bytes]:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock, so that of several threads and processes one prepares and the others find it done.
+    """Hold a folder's lock, so that one thread or process prepares and the others reuse the result.
 
     The system frees it when its holder dies. Raises TrapsError.
     """
@@ -364,9 +360,9 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 class UriCache:
-    """Data URIs of what was sent last, by digest, bounded by their total length in bytes.
+    """An LRU cache of data URIs, by digest, bounded by their total length in bytes.
 
-    One thread encodes at a time: of many that want the same clip one encodes, the others find it.
+    Threads that want the same clip at once share one encoding.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -375,7 +371,7 @@ class UriCache:
         self._kept: OrderedDict[tuple[Profile, str], tuple[str, ...]] = OrderedDict()
 
     def get(self, media: Media) -> tuple[str, ...]:
-        """Return the data URIs of `payload`, in order; raises what that raises."""
+        """Return the data URIs of `payload`, in order. Raises the same errors."""
         key = (media.profile, media.sha256)
         with self._lock:
             uri = self._kept.get(key)
@@ -396,5 +392,5 @@ _URIS = UriCache(CACHE_BYTES)
 
 
 def data_uris(media: Media) -> tuple[str, ...]:
-    """Return what `payload` gives, or raises, as data URIs, from a cache that this process's calls share."""
+    """Return `payload` as data URIs, from a cache that this process's calls share. Raises the same errors."""
     return _URIS.get(media)

@@ -1,4 +1,4 @@
-"""Parquet tables of a workspace: schema-checked, written whole or not at all, read as one dataset."""
+"""Parquet tables of a workspace: schema-checked, written atomically, read as one dataset."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ if TYPE_CHECKING:
 
 
 _FOOTER, _SUFFIX = b"traps", ".parquet"
-# A file holds the digest of its own bytes, in its footer, behind this mark: taken while zeros stood in its place.
+# Marks the digest of a file's own bytes in its footer, computed with zeros in the digest's place.
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
-_ROWS_AT_ONCE = 1000  # of a table as Python values
-_WHOLE: dict[Path, str] = {}  # files whose bytes this process has held against the digest in them, by their stamp
-_FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # of files, with their stamp
+_ROWS_AT_ONCE = 1000  # rows converted to Python values at a time
+_WHOLE: dict[Path, str] = {}  # files whose digest this process has verified, with their stamp
+_FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # footers by file, with its stamp
 
 
 @dataclass(frozen=True)
 class State:
-    """What a partition's footer says: its data version, the versions of its inputs, its rows, its failed answers, and
-    the version of the code that made it."""
+    """The footer of a partition: data version, input versions, number of rows and of failed answers, code version."""
 
     version: str
     inputs: dict[str, str]
@@ -47,8 +46,10 @@ class State:
 
 @dataclass(frozen=True)
 class StageOutput:
-    """What a stage has made of a partition, before it is written: a table's rows or files by path, what they took, what
-    else a person wants to see of them, and what their checks look at beside them."""
+    """A stage's output for a partition, before it is written: rows of a table, or files by path.
+
+    Also its tally of work, the extra content to show of it, and data for its checks.
+    """
 
     content: Sequence[Any] | pd.DataFrame | Mapping[str, bytes]
     tally: Tally = field(default_factory=Tally)
@@ -56,17 +57,17 @@ class StageOutput:
     beside: Any = None
 
     def rows(self, table: Table[Row]) -> Sequence[Row]:
-        """Return the rows of a table that is made row by row."""
+        """Return the rows of a table that is built row by row."""
         return cast("Sequence[Row]", self.content)
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows of a table that is made as a frame."""
+        """The rows of a table that is built as a frame."""
         return cast("pd.DataFrame", self.content)
 
 
 def joined(parts: Sequence[StageOutput]) -> StageOutput:
-    """Return what parts of a partition were made of, as one: rows, tallies and numbers shown are added up."""
+    """Return the outputs of parts of a partition as one: rows are joined, tallies and shown numbers added up."""
     first, *others = parts
     for other in others:
         first.tally.add(other.tally)
@@ -82,7 +83,7 @@ class TableStore:
         self.root, self._store = root, store or FolderStore(root)
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
-        """Return the file of one partition: `<table>/<value>/.../<value>.parquet`, or `<table>/<table>.parquet`.
+        """Return the file of a partition: `<table>/<value>/.../<value>.parquet`, or `<table>/<table>.parquet`.
 
         No name is `column=value`: a file holds its partition columns, and readers would add them once more.
         """
@@ -101,12 +102,12 @@ class TableStore:
         failed: int = 0,
         code: str = "1",
     ) -> str:
-        """Write one partition and return its data version (a digest of its content, volatile columns aside).
+        """Write one partition and return its data version (a digest of its content without volatile columns).
 
-        Rows are values of the table's dataclass, or a frame. They are sorted by the table's key. `inputs` (versions of
-        what the rows were made from) and `failed` (answers that a next run should ask again) go into the file's footer
-        with the version. Raises TrapsError when a row breaks the schema or a key repeats, and when the disk is full;
-        the partition's former file then still stands. code is the version of what made the rows.
+        Rows are values of the table's dataclass, or a frame. They are sorted by the table's key. The footer records
+        `inputs` (versions of upstream partitions), `failed` (answers to ask again in the next run), the data version
+        and code, the version of the code that made the rows. Raises TrapsError if a row breaks the schema, a key
+        repeats or the disk is full; the partition's former file is then unchanged.
         """
         data = self._checked(table, partition, rows)
         version = content_version(data)
@@ -155,8 +156,11 @@ class TableStore:
         return data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
-        """Return what the footer of a partition says; None if it was never written, or by a version with other columns
-        (it is then made anew). Raises TrapsError if it is unreadable."""
+        """Return the footer of a partition.
+
+        None if it was never written, or written with other columns (it is then rebuilt). Raises TrapsError if it is
+        unreadable.
+        """
         import pyarrow as pa
 
         path = self.path(table, partition)
@@ -174,14 +178,13 @@ class TableStore:
             raise _unreadable(path, table, error) from error
 
     def damage(self, table: Table, partition: Mapping[str, Any], *, thorough: bool = False) -> str:
-        """Return what is wrong with a partition's file, in words; empty where its content is what was written, or where
-        there is no file.
+        """Return what is wrong with a partition's file, in words; empty if it is intact or missing.
 
-        The bytes of a file are held against the digest in it. thorough: what a store notes of it is not believed.
+        The bytes of a file are compared with the digest in it. thorough: do not trust what a store has noted of it.
         """
         path = self.path(table, partition)
         if not thorough and self._store.note(path) is not None:
-            return ""  # the row vouches for it, and whoever reads it holds it against the row's digest
+            return ""  # the database's row vouches for it, and every reader compares it with the row's digest
         try:
             file = self._store.here(path)
             if _WHOLE.get(file) != _stamp(file.stat()):
@@ -193,19 +196,21 @@ class TableStore:
         return ""
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """Return one partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""
+        """Return one partition. Raises TrapsError naming the file and the stage to materialize if it is missing."""
         return self._load(table, self.path(table, partition), columns).to_pandas()
 
     def records(
         self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
     ) -> Iterator[dict[str, Any]]:
-        """Yield the rows of one partition as mappings, of which few are held at once. Raises as `read` does."""
+        """Yield the rows of one partition as mappings, holding few at once. Raises TrapsError as `read` does."""
         for batch in self._load(table, self.path(table, partition), columns).to_batches(_ROWS_AT_ONCE):
             yield from batch.to_pylist()
 
     def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
-        """Return all partitions whose partition columns equal the given values (of several given, any of them); an
-        empty frame if there are none."""
+        """Return all partitions with the given values of partition columns (a list: any of them).
+
+        The frame is empty if there are none.
+        """
         return self.read_arrow(table, columns, **equal).to_pandas()
 
     def read_arrow(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pa.Table:
@@ -224,9 +229,7 @@ class TableStore:
         return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
 
     def partitions(self, table: Table) -> list[dict[str, str]]:
-        """Return the partitions of a table that are there, in the order of their paths; values as the paths have
-        them.
-        """
+        """Return the existing partitions of a table, sorted by path; values as in the paths."""
         root = self.root / table.name
         paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
         values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
@@ -249,7 +252,7 @@ class TableStore:
 
 
 def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) -> None:
-    """Write a Parquet file, whole or not at all, with metadata and the digest of its own bytes in its footer."""
+    """Write a Parquet file atomically, with metadata and the digest of its own bytes in its footer."""
     write_bytes(path, sealed(data, metadata), durable=True)
 
 
@@ -266,9 +269,9 @@ def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
 
 
 def read_sealed(path: Path) -> pa.Table:
-    """Return a Parquet file if its bytes are what was written.
+    """Return a Parquet file after verifying its bytes.
 
-    Raises TrapsError if they are not, FileNotFoundError, and OSError or ArrowException if it is no Parquet file.
+    Raises TrapsError if they have changed, FileNotFoundError, and OSError or ArrowException if it is no Parquet file.
     """
     import pyarrow.parquet as pq
 
@@ -276,8 +279,7 @@ def read_sealed(path: Path) -> pa.Table:
 
 
 def note_of(path: Path) -> str:
-    """Return what a store notes of a partition: its footer, and its columns. Raises TrapsError where it is not what was
-    written."""
+    """Return a store's note about a partition: its footer and its columns. Raises TrapsError if the file is damaged."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -293,15 +295,19 @@ def _note(footer: str, names: Sequence[str]) -> str:
 
 
 def _sum_of(content: bytes) -> bytes:
-    """Return the digest that belongs behind the last mark of a file's bytes: CRC-32, which finds every flipped bit at a
-    fifteenth of what reading the table costs. What people alter is found by the rows' version."""
+    """Return the digest that belongs behind the last mark of a file's bytes.
+
+    It is a CRC-32, which finds every flipped bit at a fifteenth of the time of reading the table. Deliberate edits are
+    found by the rows' version.
+    """
     place, view = content.rfind(_MARK) + len(_MARK), memoryview(content)
     return b"%08x" % crc32(view[place + len(_ZEROS) :], crc32(_ZEROS, crc32(view[:place])))
 
 
 def _sound_bytes(path: Path) -> pa.BufferReader:
-    """Return a file's bytes if they are what was written. Raises TrapsError if not. The bytes that this process has
-    checked are not checked again while size and time are the same.
+    """Return a file's bytes after verifying them. Raises TrapsError if they are damaged.
+
+    Verified bytes are not verified again in this process while size and time are unchanged.
 
     Arrow's threads read a buffer without Python: with a file object of Python's they may meet an interpreter that is
     ending, and abort or hang (https://github.com/apache/arrow/issues/50482).
@@ -319,8 +325,10 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
 
 
 def _footer_of(path: Path) -> tuple[State, list[str]]:
-    """Return what a file's footer says, and the names of its columns; kept while its size and time are the same, since
-    a run asks for each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException."""
+    """Return a file's footer and the names of its columns; cached while its size and time are unchanged.
+
+    A run reads each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException.
+    """
     import pyarrow.parquet as pq
 
     stamp = _stamp(path.stat())
@@ -331,7 +339,7 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
 
 
 def altered(path: Path) -> str:
-    """Return what is wrong with the bytes of a table's file, in words; empty where they are what was written."""
+    """Return what is wrong with the bytes of a table's file, in words; empty if they are intact."""
     try:
         _sound_bytes(path)
     except (TrapsError, OSError) as error:
@@ -344,7 +352,7 @@ def _stamp(status: os.stat_result) -> str:
 
 
 def _column(rows: Sequence[Any], field: pa.Field) -> pa.Array:
-    """Return a column of rows, NaN as a missing value, which is what it is in a data frame."""
+    """Return a column of rows, with NaN as a missing value, as in a data frame."""
     import pyarrow as pa
 
     values = (getattr(row, field.name, None) for row in rows)
@@ -365,8 +373,9 @@ def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
 
 
 def content_version(data: pa.Table) -> str:
-    """Return the digest of a table's content, volatile columns left out: unchanged content makes nothing downstream
-    stale.
+    """Return the digest of a table's content without volatile columns.
+
+    Unchanged content makes nothing downstream stale.
     """
     lasting = data.drop_columns([c for c in VOLATILE if c in data.column_names])
     rows = (row for batch in lasting.to_batches(max_chunksize=_ROWS_AT_ONCE) for row in batch.to_pylist())

@@ -1,4 +1,4 @@
-"""Where a study can lie: in a folder of this machine, or at an address in an object store."""
+"""The location of a study: a folder of this machine, or an address in an object store."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from traps_pipeline.base.names import LONGEST
 from traps_pipeline.base.paths import require_history_path, user_cache
 
 STUDY = "study.yaml"
-SCRATCH = "TRAPS_SCRATCH"  # names the folder in which the files of object stores are while they are used
+SCRATCH = "TRAPS_SCRATCH"  # environment variable: the local folder for files of object stores
 SCHEMES = ("s3", "gs", "az")
 Place = Path | str  # a folder, or an address s3://bucket/study
 
 
 def place_of(text: str) -> Place:
-    """Return what a person names: an address in an object store, or a folder. Raises TrapsError for another address."""
+    """Return the place that a text names: an object store's address, or a folder.
+
+    Raises TrapsError for another address.
+    """
     if "://" not in text:
         folder = Path(text).absolute()
         require_history_path(folder)
@@ -34,11 +37,11 @@ def place_of(text: str) -> Place:
 
 
 def name_of(place: Place) -> str:
-    """Return a name that no study elsewhere has: the folder's, and a digest of where it was made."""
+    """Return a unique name of a study: the folder's, and a digest of where it was created."""
     plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
     return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
 
 
 def scratch_of(address: str) -> Path:
-    """Return the folder of this machine for the files of a study in an object store."""
+    """Return the local folder for the files of a study in an object store."""
     return Path(os.environ.get(SCRATCH) or user_cache()).absolute() / name_of(address)

@@ -1,4 +1,4 @@
-"""How probable each answer to a graded cut is, as its arm measured it (docs/arms.md, "Graded cuts")."""
+"""The measured probability of each answer to a graded cut (docs/arms.md, "Graded cuts")."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def posteriors(workspace: Workspace) -> dict[str, dict[str, float]]:
-    """Return the probability of each answer that any future ends in, by scenario; of those that have a graded cut."""
+    """Return the probabilities of possible answers, by scenario, for scenarios with a graded cut."""
     rows = workspace.tables.read_all(ARMS, ["scenario_id", "arm", "refused", "evidence"])
     rows = rows.loc[rows["arm"].eq(GRADED) & rows["refused"].isna()]
     return {

@@ -1,6 +1,6 @@
-"""The one door to what only several hosts need: the room `traps_pipeline.cluster`, which no other room imports.
+"""The one entry point to the room `traps_pipeline.cluster`, which only several hosts need and no other room imports.
 
-It is found by its name, and only where a study has a database that hosts share.
+It is imported by name, and only if a study has a database that hosts share.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _ROOM = "traps_pipeline.cluster.entry"
 
 
 class SeveralHosts(Protocol):
-    """What other rooms ask for. workspace: a `Workspace`, which itself asks here."""
+    """The interface that other rooms use. workspace: a `Workspace`, which itself asks here."""
 
     def open_store(self, place: Place, root: Path, study: Study | None = None) -> Store | None:
-        """Return the files of a study with a database, in a folder that several hosts see or at an address in an object
-        store; they lie below `root` while they are used.
+        """Return the files of a study with a database, in a shared folder or an object store.
 
-        study: what `study.yaml` says or will say, where that is known; else the address tells, and None is returned
-        where no study lies there. Raises TrapsError where the store or its database cannot be used.
+        They lie below `root` while they are used. study: the contents of `study.yaml`, if known; else they are read
+        from the address, and None is returned if there is no study. Raises TrapsError if the store or its database
+        cannot be used.
         """
         ...
 
@@ -37,8 +37,10 @@ class SeveralHosts(Protocol):
         ...
 
     def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> Any:
-        """Return the `Runs` that hosts of a cluster make (`pipeline/runs.py`), once those of earlier commands have
-        ended. options: of `traps run`. Raises TrapsError where no run can be submitted from this host."""
+        """Return the `Runs` of a cluster (`pipeline/runs.py`), once those of earlier commands have ended.
+
+        options: of `traps run`. Raises TrapsError if no run can be submitted from this host.
+        """
         ...
 
     def sensors(self) -> Sequence[dg.SensorDefinition]:
@@ -47,5 +49,5 @@ class SeveralHosts(Protocol):
 
 
 def several_hosts() -> SeveralHosts:
-    """Return the room for several hosts."""
+    """Return the module for several hosts."""
     return cast(SeveralHosts, import_module(_ROOM))

@@ -1,9 +1,8 @@
-"""Where a study's files lie: one interface with two implementations, which what reads and writes files does not tell
-apart (`Workspace.is_shared` does, for what several hosts cannot share).
+"""Storage for a study's files: one interface for a folder of one machine and for an object store.
 
-In a folder of one machine (`FolderStore`), or in an object store that several hosts share. Code
-names a file by its path below the workspace's folder on this machine, makes it there, and hands it over with `keep`;
-before it reads files that another host may have made, it asks for them with `bring`. In a folder both do nothing.
+Code names a file by its path below the workspace's folder on this machine, writes it there, and publishes it with
+`keep`; before it reads files that another host may have written, it fetches them with `bring`. In a folder
+(`FolderStore`) both do nothing. Only `Workspace.is_shared` tells the two apart, for what several hosts cannot share.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, try_lock, write_bytes
 
-GRACE_DAYS = 7.0  # an object that nobody names is younger while it is written
-LEASES = ".leases"  # in a study's folder: the files of pieces of work that are under way
+GRACE_DAYS = 7.0  # an unreferenced younger object may still be being written
+LEASES = ".leases"  # in a study's folder: lease files
 
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to a piece of work, which no other process has until `close` or the end of this process."""
+    """An exclusive right to a piece of work, held until `close` or the end of this process."""
 
     close: Callable[[], None]
 
 
 @dataclass(frozen=True)
 class UnusedObject:
-    """An object in a study's store that nobody names. size: in bytes; at: when it was written, by the store's clock."""
+    """An unreferenced object in a study's store. size: in bytes; at: when it was written, by the store's clock."""
 
     name: str
     size: int
@@ -41,82 +40,82 @@ class UnusedObject:
 
 
 class Store(ABC):
-    """The files of one study. root: the folder on this machine below which every path lies."""
+    """The files of one study. root: the local folder below which every path lies."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     @abstractmethod
     def here(self, path: Path) -> Path:
-        """Return a file on this machine that holds what is current under that path; nobody changes it while it is read.
+        """Return a local file with the current content of a path; nobody changes it while it is read.
 
-        Raises FileNotFoundError where there is none, TrapsError where it is not what was written or cannot be had.
+        Raises FileNotFoundError if there is none, TrapsError if it is damaged or cannot be fetched.
         """
 
     @abstractmethod
     def bring(self, paths: Iterable[Path]) -> None:
-        """See to it that these files lie at their paths on this machine, as far as they exist. Raises TrapsError."""
+        """Fetch these files, if they exist, to their local paths. Raises TrapsError."""
 
     @abstractmethod
     def keep(self, paths: Iterable[Path]) -> None:
-        """Make what lies at these paths on this machine current for every host: all of them or none. Raises TrapsError
-        and OSError."""
+        """Publish these local files to every host, all or none. Raises TrapsError and OSError."""
 
     @abstractmethod
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
-        """Make these contents current: all of them or none, where several hosts see them. note: what `note` will say
-        of them. durable: not even a power cut leaves a torn file. Raises TrapsError."""
+        """Write these contents, all or none if several hosts see them.
 
-    @abstractmethod
-    def remove(self, paths: Iterable[Path]) -> None:
-        """Let nothing be current under these paths."""
-
-    @abstractmethod
-    def has(self, path: Path) -> bool:
-        """Return whether something is current under that path."""
-
-    @abstractmethod
-    def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """Return the sizes, in bytes, of those files that are really there."""
-
-    @abstractmethod
-    def there(self, paths: Iterable[Path]) -> set[Path]:
-        """Return those of these paths under which something is current. No content is looked for."""
-
-    @abstractmethod
-    def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """Return the SHA-256, in hex, of what is current under these paths, as far as something is. No content is
-        fetched."""
-
-    @abstractmethod
-    def lease(self, name: str) -> Lease | None:
-        """Take a piece of work of the study; None where another process, on whatever host, has it, or this one. It is
-        free again when the lease is closed, and soon after its process or host is dead. A host that is cut off may lose
-        it and not know, so what is made under a lease must be such that twice is as good as once. Raises TrapsError."""
-
-    @abstractmethod
-    def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
-        """Return the files below a folder whose paths from there match a pattern, hidden ones left out, in order."""
-
-    @abstractmethod
-    def note(self, path: Path) -> str | None:
-        """Return what was noted of a file when it was written; None where nothing was, and only the file itself
-        tells.
+        note: returned by `note` later. durable: not even a power cut leaves a torn file. Raises TrapsError.
         """
 
     @abstractmethod
+    def remove(self, paths: Iterable[Path]) -> None:
+        """Remove the files of these paths."""
+
+    @abstractmethod
+    def has(self, path: Path) -> bool:
+        """Return whether a path has a file."""
+
+    @abstractmethod
+    def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
+        """Return the sizes, in bytes, of those files that exist."""
+
+    @abstractmethod
+    def there(self, paths: Iterable[Path]) -> set[Path]:
+        """Return those of these paths that have a file, without looking at any content."""
+
+    @abstractmethod
+    def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
+        """Return the SHA-256, in hex, of those files that exist, without fetching any content."""
+
+    @abstractmethod
+    def lease(self, name: str) -> Lease | None:
+        """Take a lease on a piece of work; None if any process, this one included, holds it.
+
+        It ends when it is closed, and soon after its process or host has died. A host that is cut off may lose it
+        unknowingly, so work under a lease must be idempotent. Raises TrapsError.
+        """
+
+    @abstractmethod
+    def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
+        """Return the files below a folder whose relative paths match a pattern, sorted, without hidden ones."""
+
+    @abstractmethod
+    def note(self, path: Path) -> str | None:
+        """Return the note that was written with a file; None without one, if only the file itself can tell."""
+
+    @abstractmethod
     def changed_ns(self, path: Path) -> int:
-        """Return when the file was written, in ns since 1970; 0 where there is none."""
+        """Return when a file was written, in ns since 1970; 0 if it does not exist."""
 
     @abstractmethod
     def look(self) -> None:
-        """See what other hosts have made until now. Without it, what is seen may be half a second old."""
+        """Refresh the view of other hosts' files, which may otherwise be half a second old."""
 
     def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
-        """Return objects that nobody names, the oldest first, and remove them if asked to; a folder has none.
+        """Return unreferenced objects, the oldest first, and remove them if asked to; a folder has none.
 
-        grace_days: how old they are at least, GRACE_DAYS if None. Raises TrapsError where the store cannot be used, or
-        is another study's.
+        grace_days: their minimum age, GRACE_DAYS if None. Raises TrapsError if the store cannot be used, or is another
+        study's.
         """
         return []
 
@@ -167,7 +166,7 @@ class FolderStore(Store):
         return {path: file_digest(path) for path in self.there(paths)}
 
     def lease(self, name: str) -> Lease | None:
-        """See `Store`. A lock on a file, which is there while it is held."""
+        """See `Store`. A lock on a file, which exists while it is held."""
         folder = self.root / LEASES
         path = folder / name.replace("/", "-")
         with writable(folder):
@@ -175,7 +174,7 @@ class FolderStore(Store):
 
         def close() -> None:
             assert held is not None, "only what is held is closed"
-            path.unlink(missing_ok=True)  # first: who opened it meanwhile sees that it holds no lock any more
+            path.unlink(missing_ok=True)  # first, so that a process that has opened it finds it gone
             os.close(held)
             with suppress(OSError):
                 folder.rmdir()  # unless there are others
@@ -201,7 +200,7 @@ class FolderStore(Store):
 
 @contextmanager
 def writable(folder: Path) -> Iterator[None]:
-    """Raise TrapsError where nothing can be written in a folder."""
+    """Raise TrapsError if a folder is not writable."""
     try:
         yield
     except OSError as error:
@@ -209,5 +208,5 @@ def writable(folder: Path) -> Iterator[None]:
 
 
 def is_hidden(relative: Path) -> bool:
-    """Return whether a file, or a folder on the way to it, has a name with a dot before it: locks, unfinished files."""
+    """Return whether a file or a folder on its path has a name that begins with a dot: locks, unfinished files."""
     return any(part.startswith(".") for part in relative.parts)

@@ -1,8 +1,7 @@
-"""A study of one machine, moved into an object store: its answers, votes and spending into the database, and its files
-under their digests. Nothing of it is asked, rendered or extracted again.
+"""Move a study of one machine into an object store: rows and spending into the database, files under their digests.
 
-Until all is there, nothing lies at the address, and the folder is the study; a move that is killed is done again. Then
-the folder is a study no more, so that nobody pays twice; its files stay where they are.
+Nothing is asked, rendered or extracted again. Until everything is there, the address is empty and the folder is the
+study; a killed move is repeated. Afterwards the folder is no longer a study, so that nobody pays twice; its files stay.
 """
 
 from __future__ import annotations
@@ -18,15 +17,17 @@ from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
-# Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved by itself.
+# Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved separately.
 STAYS = ("dagster", "ledger", "reports", "labels", STUDY)
 AT_ONCE = 500  # files of one change
-LEFT = "study.moved.yaml"  # what study.yaml of the folder is called then
+LEFT = "study.moved.yaml"  # the new name of the folder's study.yaml
 
 
 def move_to_store(workspace: Workspace, address: Place) -> int:
-    """Move a study from its folder to an address (s3://BUCKET/STUDY); the number of rows of its ledger. Raises
-    TrapsError, also while anybody asks."""
+    """Move a study from its folder to an address (s3://BUCKET/STUDY); return the number of rows of its ledger.
+
+    Raises TrapsError, also while another process writes to the ledger.
+    """
     if not isinstance(address, str):
         raise TrapsError(f"{address}: is a folder; --store names an address in an object store, s3://BUCKET/STUDY")
     if workspace.is_shared or workspace.study.database:

@@ -1,4 +1,4 @@
-"""What `study.yaml` says: the benchmark of a workspace, its experiments, its money, and what is asked inside models."""
+"""The contents of `study.yaml`: a workspace's benchmark, experiments, budget and mechanistic analyses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from traps_pipeline.protocol.datasets import is_ill_posed
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, VQA_PROMPTS
 from traps_pipeline.storage.media import MediaSpec
 
-FORMAT = 1  # of a workspace
+FORMAT = 1  # version of a workspace's format
 Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
@@ -43,8 +43,10 @@ class ProbeSettings(BaseModel):
 
 
 class NullSettings(BaseModel):
-    """The directions against which an effect is ranked: so many draws of each kind, steered at the largest dose on the
-    datasets that they come from."""
+    """The null directions against which an effect is ranked: the number of draws of each kind.
+
+    They are steered at the largest dose on the datasets that they come from.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = ("covariance",)
@@ -52,7 +54,7 @@ class NullSettings(BaseModel):
 
 
 class SteeringSettings(BaseModel):
-    """What is steered (docs/spec.md 8.2)."""
+    """The settings of steering (docs/spec.md 8.2)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(default=(2, 5, 10), min_length=1)
@@ -78,7 +80,7 @@ class SteeringSettings(BaseModel):
     max_new_tokens: int = Field(default=512, ge=1)
 
     def direction_pairs(self, dataset: str) -> int:
-        """Return how many pairs the directions of a dataset come from at most."""
+        """Return the maximum number of pairs behind a dataset's directions."""
         return self.ill_posed_pairs if is_ill_posed(dataset) else self.well_posed_pairs
 
     @field_validator("alphas", "gaps")
@@ -117,7 +119,7 @@ class PatchingSettings(BaseModel):
 
 
 class MechanismSettings(BaseModel):
-    """`mechanism:` of an experiment and of `study.yaml`. models: the local models, and their layers."""
+    """The section `mechanism:` of an experiment and of `study.yaml`. models: the local models, and their layers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     models: dict[str, Layers] = Field(min_length=1)
@@ -162,7 +164,7 @@ class MechanismSettings(BaseModel):
 
 
 class Asked(BaseModel):
-    """What one experiment asks about a study's scenarios. mechanism: whether it looks inside local models."""
+    """One experiment's requests about a study's scenarios. mechanism: whether it includes mechanistic analyses."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     datasets: tuple[str, ...]
@@ -213,7 +215,7 @@ class Study(BaseModel):
 
     @property
     def is_subset(self) -> bool:
-        """Whether the study leaves scenarios of its benchmark out."""
+        """Whether the study leaves out scenarios of its benchmark."""
         return self.scenarios is not None or self.per_family is not None
 
     @model_validator(mode="after")

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Row = TypeVar("Row")
 
-# Columns of which two runs of the same study may differ; they take no part in data versions.
+# Columns that may differ between two runs of the same study, so data versions ignore them.
 VOLATILE = ("created_at", "latency_s", "attempts")
 TYPES: tuple[Any, ...] = (str, int, float, bool, datetime, list[str])
 
@@ -48,20 +48,20 @@ class StoredColumn:
 
     @property
     def type_name(self) -> str:
-        """The type as one writes it: str, list[str], datetime."""
+        """The type's name: str, list[str], datetime."""
         return str(self.type) if get_origin(self.type) else self.type.__name__
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Marks a figure's column: beside it stand columns named after it with these suffixes, of this type and meaning."""
+    """Marks a column that has further columns beside it, with these suffixes, of this type and meaning."""
 
     suffixes: tuple[str, ...]
     column: Any
 
 
 def with_neighbours(row_type: type[Row]) -> type[Row]:
-    """Declare the columns that stand beside the marked ones (`Beside`); goes below `@dataclass`."""
+    """Declare the columns beside the marked ones (`Beside`); place it below `@dataclass`."""
     annotations = dict[str, Any]()
     for name, annotation in row_type.__annotations__.items():
         annotations[name] = annotation
@@ -75,8 +75,8 @@ def with_neighbours(row_type: type[Row]) -> type[Row]:
 class Table(Generic[Row]):
     """A table's contract: its name, the dataclass of its rows, the columns that partition it, its key.
 
-    Layout: `tables/<table>/<value>/.../<value>.parquet`, one value for each partition column; the columns stand in the
-    file. Raises ValueError for a key or partition column that the dataclass lacks.
+    Layout: `tables/<table>/<value>/.../<value>.parquet`, one value for each partition column; the file holds these
+    columns too. Raises ValueError for a key or partition column that the dataclass lacks.
     """
 
     name: str
@@ -93,13 +93,13 @@ class Table(Generic[Row]):
 
     @property
     def row(self) -> str:
-        """What one row is, in words: the dataclass's docstring."""
+        """The meaning of a row: the dataclass's docstring."""
         words = " ".join((self.row_type.__doc__ or "").split()).removesuffix(".")
         return words[:1].lower() + words[1:]
 
     @cached_property
     def columns(self) -> tuple[StoredColumn, ...]:
-        """The columns in the order of the fields. Raises TypeError for an annotation that says no column."""
+        """The columns in the order of the fields. Raises TypeError for an annotation that declares no column."""
         return tuple(_columns(self.row_type))
 
     @property
@@ -108,7 +108,7 @@ class Table(Generic[Row]):
         return [column.name for column in self.columns]
 
     def arrow_schema(self) -> pa.Schema:
-        """Return the schema that a written file has."""
+        """Return the schema of a written file."""
         return self._schema
 
     @cached_property
@@ -138,6 +138,6 @@ def _columns(row_type: type[Any]) -> Iterator[StoredColumn]:
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows as JSON has them: None where a value is missing, lists for arrays."""
+    """Return the rows as JSON values: None for missing values, lists for arrays."""
     rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
     return [{str(k): v.tolist() if hasattr(v, "tolist") else v for k, v in row.items()} for row in rows]

@@ -1,7 +1,7 @@
-"""A workspace: one folder, or one place in an object store, that holds one study. Every path in it is made here.
+"""A workspace: one folder, or one place in an object store, that holds one study. This module defines all its paths.
 
-Code works with paths below `root`, a folder of this machine: the workspace itself, or a scratch folder, where files of
-an object store are while they are used (`storage/store.py`).
+Code works with paths below `root`, a folder of this machine: the workspace itself, or a scratch folder for the files of
+an object store (`storage/store.py`).
 """
 
 from __future__ import annotations
@@ -30,44 +30,45 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.media import MediaStore
 
 VARIABLE = "TRAPS_WORKSPACE"
-RAY = "TRAPS_RAY"  # holds the address of Ray's head, http://HEAD:8265, where runs go to a cluster
-RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # of runs on a cluster that are launched in Dagster's pages
-DATABASE = "TRAPS_DATABASE"  # the variable with the database's address, where a new study in a store names no other
+RAY = "TRAPS_RAY"  # environment variable: the address of Ray's head, http://HEAD:8265
+RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # for cluster runs that Dagster's pages launch
+DATABASE = "TRAPS_DATABASE"  # default variable for the database's address of a new study in a store
 
 
 class Workspace:
-    """Paths and stores of one study. Open with `Workspace.open`, make with `Workspace.create`."""
+    """Paths and stores of one study. Use `Workspace.open` or `Workspace.create`."""
 
     def __init__(self, root: Path, study: Study, address: str = "") -> None:
         self.root, self.study, self._address = root, study, address
 
     @property
     def place(self) -> Place:
-        """What a person names to get it: its folder, or its address in an object store."""
+        """The study's place as users name it: its folder, or its address in an object store."""
         return self._address or self.root
 
     @property
     def is_shared(self) -> bool:
-        """Whether its files lie in an object store, where several hosts see them."""
+        """Whether its files lie in an object store, which several hosts see."""
         return bool(self._address)
 
     @staticmethod
     def default_place() -> Place:
-        """Return `$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout, or, without one, in the current
-        folder."""
+        """Return `$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout or the current folder."""
         return place_of(os.environ.get(VARIABLE) or str(WORKSPACES / "default"))
 
     @staticmethod
     def is_there(place: Place) -> bool:
-        """Return whether a study lies there. Raises TrapsError where an object store cannot be used."""
+        """Return whether a place holds a study. Raises TrapsError if an object store cannot be used."""
         if isinstance(place, str):
             return several_hosts().open_store(place, scratch_of(place)) is not None
         return (place / STUDY).is_file()
 
     @staticmethod
     def file_of(place: Place, name: str) -> Path | None:
-        """Return a file at the top of a study, whether or not it can be opened; None where there is none. Raises
-        TrapsError where an object store cannot be used."""
+        """Return a file at the top of a study, even if the study cannot be opened; None if there is none.
+
+        Raises TrapsError if an object store cannot be used.
+        """
         if isinstance(place, str):
             root = scratch_of(place)
             store = several_hosts().open_store(place, root)
@@ -79,7 +80,7 @@ class Workspace:
 
     @classmethod
     def create(cls, place: Place, study: Study) -> Workspace:
-        """Make a workspace, or open it when it is there with the same benchmark. Raises TrapsError when it differs."""
+        """Create a workspace, or open an existing one of the same benchmark. Raises TrapsError if it differs."""
         require_root()
         if cls.is_there(place):
             workspace = cls.open(place)
@@ -109,14 +110,14 @@ class Workspace:
             (self.root / folder).mkdir(parents=True, exist_ok=True)
 
     def save_study(self) -> None:
-        """Write `study.yaml`, which every run in this workspace reads, whoever starts it."""
+        """Write `study.yaml`, which every run in this workspace reads."""
         study = {name: value for name, value in self.study.model_dump(mode="json").items() if value is not None}
-        # Further down null is said: `mechanism.steering: null` asks for no steering, and left out it asks for all.
+        # Nested nulls are written: `mechanism.steering: null` requests no steering, a missing key requests all.
         self.store.write({self.root / STUDY: yaml.safe_dump(study, sort_keys=False).encode()})
 
     @property
     def mechanism(self) -> MechanismSettings:
-        """What the study asks inside local models. Raises TrapsError when it asks nothing."""
+        """The study's mechanistic settings. Raises TrapsError if it has none."""
         if self.study.mechanism is None:
             raise TrapsError(
                 f"{self.root}/study.yaml: asks nothing inside models; run an experiment with a `mechanism:` section "
@@ -125,15 +126,17 @@ class Workspace:
         return self.study.mechanism
 
     def allow(self, **changes: Any) -> Workspace:
-        """Return the workspace with other values of fields that may change: budgets, prices, mechanism, experiments."""
+        """Return the workspace with changed fields of the study: budgets, prices, mechanism, experiments."""
         changed = Workspace(self.root, self.study.model_copy(update=changes), self._address)
         changed.save_study()
         return changed
 
     @classmethod
     def open(cls, place: Place | None = None) -> Workspace:
-        """Return the workspace at a place (default: `default_place()`). Raises TrapsError naming the file and the
-        remedy."""
+        """Return the workspace at a place (default: `default_place()`).
+
+        Raises TrapsError naming the file and the remedy.
+        """
         place = place or cls.default_place()
         path = cls.file_of(place, STUDY)
         if path is None:
@@ -151,48 +154,53 @@ class Workspace:
         return cls(scratch_of(place), study, place) if isinstance(place, str) else cls(place.absolute(), study)
 
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
-        """Give Dagster's folder (default: the workspace's) the checkout's `dagster.yaml`, unless it has one of its own
-        (another storage, say)."""
+        """Copy the checkout's `dagster.yaml` to Dagster's folder (default: the workspace's) if it has none.
+
+        A study's own `dagster.yaml` may name another storage.
+        """
         own = (home or self.dagster_home) / "dagster.yaml"
         if own.is_symlink() or not own.exists():
             write_text(own, (ROOT / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def is_on_cluster(self) -> bool:
-        """Whether runs of this study may go to other hosts, and its history therefore lies in its database."""
+        """Whether runs of this study may go to other hosts, so that its history lies in its database."""
         return bool(self.study.database and os.environ.get(RAY))
 
     @property
     def dagster_home(self) -> Path:
-        """Dagster's own history (DAGSTER_HOME). Where several hosts share the folder and their runs do not go to a
-        cluster, each host has one of its own: SQLite does not work on network file systems."""
+        """Dagster's folder (DAGSTER_HOME).
+
+        If several hosts share the study and its runs do not go to a cluster, each host has its own: SQLite does not
+        work on network file systems.
+        """
         if self.is_on_cluster:
             return self.root / "cluster"
         return (scratch_of(str(self.root)) if self.study.database and not self._address else self.root) / "dagster"
 
     @property
     def reports(self) -> Path:
-        """Pages and figures for people."""
+        """The folder of pages and figures for people."""
         return self.root / "reports"
 
     @property
     def labels(self) -> Path:
-        """What people labelled: the database of the pages, and the append-only file that stages read."""
+        """The folder of people's labels: the database of the pages, and the append-only file that stages read."""
         return self.root / "labels"
 
     @property
     def trajectories(self) -> Path:
-        """Trajectories simulated here because a correction changed parameters."""
+        """The folder of trajectories that were simulated here because a correction changed parameters."""
         return self.root / "trajectories"
 
     @property
     def ledger_folder(self) -> Path:
-        """The ledger of a study that is on one machine, and its locks."""
+        """The folder of the ledger of a study on one machine, and of its locks."""
         return self.root / "ledger"
 
     @property
     def locks(self) -> Path:
-        """Lock files of stages that must not run twice at once."""
+        """The folder of lock files for stages that must not run concurrently."""
         return self.ledger_folder / "locks"
 
     @cached_property
@@ -218,22 +226,24 @@ class Workspace:
 
     @cached_property
     def answers(self) -> Ledger:
-        """Every answer ever paid for."""
+        """The ledger of all paid answers."""
         from traps_pipeline.ledger.ledger import Ledger
 
         return Ledger(self.ledger, "answers")
 
     @cached_property
     def votes(self) -> Ledger:
-        """Every vote ever paid for."""
+        """The ledger of all paid votes."""
         from traps_pipeline.ledger.ledger import Ledger
 
         return Ledger(self.ledger, "votes")
 
     @cached_property
     def ledger(self) -> Database:
-        """The database of answers, votes and money: in the study's folder, or in PostgreSQL. Raises TrapsError naming
-        the variable and the remedy."""
+        """The database of answers, votes and money: in the study's folder, or in PostgreSQL.
+
+        Raises TrapsError naming the variable and the remedy.
+        """
         from traps_pipeline.ledger.postgres import postgres_of
         from traps_pipeline.ledger.sqlite import SqliteDatabase
 
@@ -242,22 +252,20 @@ class Workspace:
         return SqliteDatabase(self.ledger_folder)
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
-        """Return file that exists while a check of a partition does not pass; it holds the details."""
+        """Return the file that exists while a check of a partition fails; it holds the details."""
         return self.root / "checks" / stage / check / f"{key or stage}.json"
 
     def failed_checks(self, stage: str, key: str | None) -> list[str]:
-        """Return the names of the checks of a partition that do not pass."""
+        """Return the names of a partition's failed checks."""
         files = self.store.below(self.root / "checks" / stage, f"*/{key or stage}.json")
         return sorted(path.parent.name for path in files)
 
     def failure(self, stage: str, check: str, key: str | None) -> str:
-        """Return what is wrong where a check does not pass, as JSON."""
+        """Return the details of a failed check, as JSON."""
         return self.store.here(self.failed_check(stage, check, key)).read_text(encoding="utf-8")
 
     def clip(self, scenario_id: str, side: str, scene_hash: str) -> Path:
-        """Return path of a clip; its name holds the scene hash, so a corrected scene never overwrites what was
-        judged.
-        """
+        """Return a clip's path. Its name contains the scene hash, so a corrected scene overwrites no judged one."""
         return self.root / "clips" / scenario_id / f"{side}-{scene_hash[:16]}.mp4"
 
     def relative(self, path: Path) -> str:
@@ -265,21 +273,21 @@ class Workspace:
         return path.relative_to(self.root).as_posix()
 
     def resolve(self, relative: str) -> Path:
-        """Return inverse of `relative`: the file as it lies on this machine, if there is one."""
+        """Return the local file of a path that `relative` returned, if there is one."""
         self.store.bring([self.root / relative])
         return self.root / relative
 
     def bring(self, relatives: Iterable[str]) -> Path:
-        """Return the folder below which these files lie on this machine, as far as they exist. Raises TrapsError."""
+        """Fetch these files, if they exist, and return the local folder that holds them. Raises TrapsError."""
         self.store.bring(self.root / relative for relative in relatives)
         return self.root
 
     def bring_folder(self, folder: Path) -> Path:
-        """Return a folder of the study, after its files were brought to this machine. Raises TrapsError."""
+        """Fetch a folder's files to this machine and return the folder. Raises TrapsError."""
         self.store.bring(self.store.below(folder))
         return folder
 
     def sizes(self, relatives: Iterable[str]) -> dict[str, int]:
-        """Return the sizes, in bytes, of those files that are there, wherever they lie."""
+        """Return the sizes, in bytes, of the files that exist, wherever they lie."""
         size_of = self.store.sizes(self.root / relative for relative in relatives)
         return {self.relative(path): size for path, size in size_of.items()}

@@ -53,7 +53,7 @@ CLASSES = {
 each_family = pytest.mark.parametrize("family", FAMILIES)
 
 
-def tokens(answers: list[adapter.Generated]) -> list[tuple[int, ...]]:
+def tokens(answers: list[adapter.GeneratedAnswer]) -> list[tuple[int, ...]]:
     return [answer.tokens for answer in answers]
 
 

@@ -29,26 +29,26 @@ from traps_pipeline.models.local.checkpoint import (
     weight_bytes,
 )
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.model import Generated, LocalModel, States
+from traps_pipeline.models.local.model import GeneratedAnswer, LocalModel, States
 from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.settings import SPREAD, LocalParams
 from traps_pipeline.models.registry import ModelEntry
 
-__all__ = ["Generated", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
+__all__ = ["GeneratedAnswer", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
 
 NF4_CPU_BLOCK = 64
-WEIGHTS_SHARE = 0.7  # of what is free that weights may take before other models make room; the rest is for batches
-_LOADED: OrderedDict[str, LocalModel] = OrderedDict()  # the one that was asked for last comes last
+WEIGHTS_SHARE = 0.7  # share of free memory for weights before other models are unloaded; the rest is for batches
+_LOADED: OrderedDict[str, LocalModel] = OrderedDict()  # the most recently used one comes last
 _LOADING = Lock()
 
 
 def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
-    """Return the entry's checkpoint in memory, as the entry says; loaded once a process, and unloaded where another
-    model needs its memory.
+    """Return the entry's checkpoint in memory, loaded once per process.
 
-    inside: as it is looked into (`mechanism:` of the entry), not as it answers. Raises TrapsError when weights, device,
-    memory or library are missing, or when the checkpoint is of no class that fits.
+    It is unloaded if another model needs its memory. inside: load it for mechanistic analyses (`mechanism:` of the
+    entry), not for answers. Raises TrapsError if weights, device, memory or library are missing, or if the checkpoint's
+    class does not fit.
     """
     params = entry.inside_params() if inside else entry.local_params()
     device = entry.device or "cpu"
@@ -69,9 +69,9 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
 
 
 def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
-    """Unload models of the device, the one asked for least recently first, until the weights fit.
+    """Unload models of the device, the least recently used first, until the weights fit.
 
-    The memory of a model that a caller still holds is free only when the caller drops it.
+    The memory of a model that a caller still holds is freed only when the caller drops it.
     """
     import torch
 
@@ -87,7 +87,7 @@ def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None
 
 
 def require_device(device: str) -> None:
-    """Raise TrapsError when this machine has no such device."""
+    """Raise TrapsError if this machine has no such device."""
     import torch
 
     exists = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
@@ -112,7 +112,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
             checkpoint.folder,
             attn_implementation=params.attn_implementation,
             local_files_only=True,
-            trust_remote_code=False,  # said, since transformers else asks on the terminal, and a `y` runs it
+            trust_remote_code=False,  # otherwise transformers asks on the terminal, and a `y` runs the code
             use_safetensors=True,
             output_loading_info=True,
             **options,
@@ -158,7 +158,7 @@ def _require_packable(network: Any, name: str) -> None:
 
 
 def _precision(params: LocalParams, device: str) -> dict[str, Any]:
-    """Return what `from_pretrained` is told about precision. Raises TrapsError without the library that NF4 needs."""
+    """Return the arguments of `from_pretrained` about precision. Raises TrapsError if NF4 lacks its library."""
     import torch
 
     options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}

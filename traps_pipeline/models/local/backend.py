@@ -1,7 +1,6 @@
-"""Local models as a backend: requests that wait are answered together, by one worker thread for each device.
+"""Local models as a backend: waiting requests are answered in batches, by one worker thread per device.
 
-Asking stays what it is for an API: one request, one outcome, one row of the ledger. So a crash loses the batch that was
-running and nothing else.
+For callers it is like an API: one request, one outcome, one row of the ledger. So a crash loses only the running batch.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from threading import Event
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.first_token import stored
-from traps_pipeline.models.framing import framed
+from traps_pipeline.models.first_token import stored_alternatives
+from traps_pipeline.models.framing import media_for_dataset
 from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
@@ -24,43 +23,43 @@ from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 from traps_pipeline.video.encode import DamagedClip
 
-GATHER_S = 0.01  # after the first waiting request, for those that the same answers have set free
+GATHER_S = 0.01  # wait after the first request for others that become free together
 
 
 @cache
 def worker(device: str) -> ThreadPoolExecutor:
-    """Return the one thread that works with the models of a device."""
+    """Return the thread that works with the models of a device."""
     return ThreadPoolExecutor(1, thread_name_prefix=f"local-model-{device}")
 
 
 @dataclass(eq=False)
 class _Batch:
-    """Requests answered together. abandoned: nobody waits for any of them any more."""
+    """Requests answered together. abandoned: no caller waits for any of them any more."""
 
     requests: list[Request] = field(default_factory=list)
     answers: list[asyncio.Future[Outcome]] = field(default_factory=list)
     abandoned: Event = field(default_factory=Event)
 
     def forget(self, _: asyncio.Future[Outcome]) -> None:
-        """Note an answer as it is known or no longer wanted."""
+        """Record that an answer is known or no longer wanted."""
         if all(answer.cancelled() for answer in self.answers):
             self.abandoned.set()
 
 
 class LocalBackend:
-    """Asks one entry's checkpoint, which is loaded at the first request."""
+    """Answers one entry's requests with its checkpoint, which is loaded at the first request."""
 
     def __init__(self, entry: Entry) -> None:
         if not isinstance(entry, ModelEntry) or entry.media is None:
             raise TrapsError(f"{entry.id}: only a model can be a local checkpoint; a judge is asked over the network")
         self._entry, self._spec, self._params = entry, entry.media, entry.local_params()
         self._worker = worker("cuda:0" if entry.device == "cuda" else entry.device or "cpu")
-        find_checkpoint(self._params)  # so that missing weights are told before anything is asked
+        find_checkpoint(self._params)  # report missing weights before anything is asked
         self._waiting = _Batch()
         self._running: asyncio.Task[None] | None = None
 
     async def ask(self, request: Request) -> Outcome:
-        """Return one attempt; see `Backend`. Raises TrapsError where asking again would not help."""
+        """Return the outcome of one attempt; see `Backend`. Raises TrapsError if a retry would not help."""
         answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._waiting.requests.append(request)
         self._waiting.answers.append(answer)
@@ -69,7 +68,7 @@ class LocalBackend:
         return await answer
 
     async def _run(self) -> None:
-        """Answer what waits, batch after batch, until nothing does."""
+        """Answer waiting requests, batch after batch, until none is left."""
         while self._waiting.requests:
             await asyncio.sleep(GATHER_S)
             batch, self._waiting = self._waiting, _Batch()
@@ -87,7 +86,7 @@ class LocalBackend:
                         answer.set_result(outcome)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Load, look and generate, in the worker thread."""
+        """Load the model, sample frames and generate answers, in the worker thread."""
         from traps_pipeline.models.local.adapter import load_local_model
         from traps_pipeline.models.local.sampling import Sampling
 
@@ -105,7 +104,7 @@ class LocalBackend:
         return [
             replace(
                 outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model),
-                first_token=stored(one.first_token, request.about.get("regime")),
+                first_token=stored_alternatives(one.first_token, request.about.get("regime")),
             )
             for request, one in zip(batch.requests, generated, strict=True)
         ]
@@ -114,18 +113,18 @@ class LocalBackend:
 def _frames(request: Request, spec: MediaSpec) -> Frames:
     assert request.media is not None, "local models are asked about clips"
     try:
-        return sample(request.media, framed(spec, dataset_of(str(request.about.get("item_id", "")))))
+        return sample(request.media, media_for_dataset(spec, dataset_of(str(request.about.get("item_id", "")))))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
 
 
 def seeds(requests: Sequence[Request]) -> list[int]:
-    """Return a seed of each request's key: runs differ, and the same call gives the same answer."""
+    """Return a seed per request, from its key: runs differ, and the same call gives the same answer."""
     return [int(request.key[:16], 16) for request in requests]
 
 
 def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
-    """Return the outcome of an answer: truncated where the limit cut it off, empty where nothing is left of it."""
+    """Return the outcome of an answer: truncated if the limit cut it off, empty if no text is left."""
     text = text.strip()
     kind = ("truncated" if finish == "length" else "answer") if text else "empty"
     return Outcome(

@@ -1,4 +1,4 @@
-"""Hidden states by hooks that keep one vector a layer, instead of the library's tensors of every token.
+"""Capture hidden states by hooks that keep one vector per layer, instead of the library's tensors of every token.
 
 Layers count as in the library's hidden_states: 0 = embeddings, l = output of the l-th block as it leaves the block. The
 library's own last state is the normed one; here both are kept.
@@ -25,7 +25,7 @@ ONE_TOKEN: tuple[Pooling, ...] = ("last", "answer")
 
 
 @dataclass
-class Captured:
+class CapturedStates:
     """States of one forward pass, on the model's device. raw: embeddings and block outputs in order, each (d,)."""
 
     raw: list[Tensor] = field(default_factory=list)
@@ -33,15 +33,15 @@ class Captured:
 
 
 def first_tensor(output: Any) -> Tensor:
-    """Return the hidden states in what a module returned: blocks of some models return a tuple."""
+    """Return the hidden states in a module's output: blocks of some models return a tuple."""
     return output[0] if isinstance(output, tuple) else output
 
 
 def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tensor:
-    """Return (1, T, d) to (d,): of the last token, in the model's precision, or the mean over all tokens, or over those
-    that a mask (T,) chooses, in float32.
+    """Return (1, T, d) pooled to (d,).
 
-    A copy: a view would keep the whole tensor alive.
+    The state of the last token, in the model's precision, or the mean over all tokens, or over those that a mask (T,)
+    selects, in float32. The result is a copy: a view would keep the whole tensor alive.
     """
     if len(states) != 1:
         raise ValueError(f"{len(states)} prompts in one pass: states are taken one prompt at a time")
@@ -53,9 +53,9 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 @contextmanager
 def capturing(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
-) -> Iterator[Captured]:
-    """Keep the pooled states of forward passes made inside; the hooks are gone afterwards, whatever happens."""
-    captured = Captured()
+) -> Iterator[CapturedStates]:
+    """Keep the pooled states of forward passes in the block; the hooks are always removed afterwards."""
+    captured = CapturedStates()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         captured.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))

@@ -1,4 +1,4 @@
-"""Where a checkpoint lies, what it is, and whether it fits into memory. Nothing is downloaded on the quiet."""
+"""Find and identify a checkpoint, and check that it fits into memory. Nothing is downloaded silently."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from traps_pipeline.base.extras import require
 from traps_pipeline.base.paths import ROOT
 from traps_pipeline.models.local.settings import SPREAD, Dtype, LocalParams, Quantisation
 
-_FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
+_FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # files of a folder that decide the model's output
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_CONFIG_BYTES = 4 * 2**20  # of a file of settings; a vocabulary is larger, and no class is looked for in it
+_CONFIG_BYTES = 4 * 2**20  # maximum bytes of a settings file; a vocabulary is larger, and names no class
 _ITEM_BYTES: dict[Dtype, int] = {"float32": 4, "bfloat16": 2, "float16": 2}
-_NF4_BYTES = 0.6  # a weight in 4 bits and its share of the scales and of what is not quantised
+_NF4_BYTES = 0.6  # bytes of a weight in 4 bits with its share of scales and of unquantised weights
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint on this disk. digest: the hub's commit, or of the folder's content."""
+    """A local checkpoint. digest: the hub's commit, or the digest of the folder's content."""
 
     name: str
     folder: Path
@@ -35,14 +35,15 @@ class Checkpoint:
 
 
 def as_folder(name: str) -> Path | None:
-    """Return the folder that a `checkpoint:` names, relative to the checkout; None: it is a hub id."""
+    """Return the folder that a `checkpoint:` names, relative to the checkout; None if it is a hub id."""
     folder = ROOT / name
     return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
 
 
 def find_checkpoint(params: LocalParams) -> Checkpoint:
-    """Return the checkpoint that an entry names. Raises TrapsError, with the command that gets it, when it is not
-    here.
+    """Return the checkpoint that an entry names.
+
+    Raises TrapsError, with the download command, if it is missing.
     """
     require("local")
     folder = as_folder(params.checkpoint)
@@ -61,11 +62,11 @@ def find_checkpoint(params: LocalParams) -> Checkpoint:
 
 
 def declared_digest(params: LocalParams) -> str | None:
-    """Return what stands for the weights in the ledger key, beside the entry: of a folder the digest of its content, of
-    a hub id the commit that is in the hub's cache.
+    """Return the digest that identifies the weights in the ledger key, beside the entry.
 
-    None for a hub id whose `revision` is a commit, and for one that is not downloaded: it can be planned, and is not
-    asked before it is here (`find_checkpoint`). Raises TrapsError when the folder is not there.
+    For a folder it is the digest of its content, for a hub id the commit in the hub's cache. None for a hub id whose
+    `revision` is a commit, and for one that is not downloaded: it can be planned, and must be downloaded before it is
+    asked (`find_checkpoint`). Raises TrapsError if the folder is missing.
     """
     folder = as_folder(params.checkpoint)
     if folder is not None:
@@ -78,13 +79,13 @@ def declared_digest(params: LocalParams) -> str | None:
 
 
 def download_command(params: LocalParams) -> str:
-    """Return what fetches a hub id's weights, where there is a network."""
+    """Return the command that downloads a hub id's weights."""
     at = f" --revision {params.revision}" if params.revision else ""
     return f"hf download {params.checkpoint}{at}"
 
 
 def _cached_snapshot(params: LocalParams) -> Path | None:
-    """Return the folder of a hub id in the hub's cache, named by its commit; None when it is not there."""
+    """Return the folder of a hub id in the hub's cache, named by its commit; None if it is missing."""
     if find_spec("huggingface_hub") is None:
         return None  # without the extra `local` the model can be planned; `find_checkpoint` then says what is missing
     from huggingface_hub import try_to_load_from_cache
@@ -110,7 +111,7 @@ def _require_whole(folder: Path, name: str, remedy: str) -> None:
 
 
 def require_no_code(checkpoint: Checkpoint) -> None:
-    """Raise TrapsError for a checkpoint that brings code: it could do whatever its user can."""
+    """Raise TrapsError for a checkpoint with its own code, which could do whatever its user can."""
     code = [path.relative_to(checkpoint.folder).as_posix() for path in sorted(checkpoint.folder.rglob("*.py"))]
     for path in sorted(checkpoint.folder.glob("*.json")):
         if path.stat().st_size <= _CONFIG_BYTES and _names_code(path):
@@ -124,7 +125,7 @@ def require_no_code(checkpoint: Checkpoint) -> None:
 
 
 def _names_code(path: Path) -> bool:
-    """Return whether settings name classes of a checkpoint's own files, however the name is spelt in JSON."""
+    """Return whether settings name classes of a checkpoint's own files, however JSON spells the name."""
     try:
         return '"auto_map"' in json.dumps(json.loads(path.read_bytes()))
     except (ValueError, RecursionError):
@@ -132,7 +133,7 @@ def _names_code(path: Path) -> bool:
 
 
 def folder_digest(folder: Path) -> str:
-    """Return the digest of a checkpoint folder's content, wherever it lies; computed anew only when a file changed."""
+    """Return the digest of a checkpoint folder's content, wherever it lies; cached until a file changes."""
     files = sorted(path for path in folder.iterdir() if path.suffix in _FILES)
     stamps = tuple((path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files)
     return _content_digest(folder, stamps)
@@ -147,7 +148,7 @@ def _content_digest(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> s
 
 
 def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> float:
-    """Return memory that the weights take when loaded so, in bytes, from the headers of their files."""
+    """Return the memory that the weights take at this precision, in bytes, from the headers of their files."""
     weights = sum(math.prod(shape) for file in sorted(folder.glob("*.safetensors")) for shape in _shapes(file))
     return weights * (_NF4_BYTES if quantisation == "nf4" else _ITEM_BYTES[dtype])
 
@@ -163,7 +164,7 @@ def _shapes(file: Path) -> list[Sequence[int]]:
 
 
 def free_bytes(device: str) -> float:
-    """Return the memory that is free on a device, in bytes; infinite where the system does not say."""
+    """Return the free memory of a device, in bytes; infinite if the system does not report it."""
     if device == SPREAD:
         import torch
 
@@ -172,7 +173,7 @@ def free_bytes(device: str) -> float:
     if device.startswith("cuda"):
         import torch
 
-        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch hands it out again
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch's cache can reuse it
         return float(torch.cuda.mem_get_info(device)[0] + cached)
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -182,7 +183,7 @@ def free_bytes(device: str) -> float:
 
 
 def require_memory(checkpoint: Checkpoint, dtype: Dtype, quantisation: Quantisation, device: str) -> None:
-    """Raise TrapsError when the weights alone do not fit."""
+    """Raise TrapsError if the weights alone do not fit."""
     needed, free = weight_bytes(checkpoint.folder, dtype, quantisation), free_bytes(device)
     if needed > free:
         raise TrapsError(

@@ -1,4 +1,4 @@
-"""Decoding of one batch: the library's own `generate`, steered, sampled by row, and ended on demand."""
+"""Decode one batch: the library's own `generate`, steered, sampled per row, and stopped on demand."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class Decodes(Protocol):
-    """A `LocalModel`, as far as it is used here."""
+class DecodingModel(Protocol):
+    """The parts of a `LocalModel` that decoding needs."""
 
     network: Any
 
@@ -26,39 +26,41 @@ class Decodes(Protocol):
 
 
 class Steers(Protocol):
-    """What may change hidden states during a pass: `mechanism.hook.Steering`."""
+    """Anything that changes hidden states during a pass, such as `mechanism.hook.Steering`."""
 
     def rows(self, chosen: Sequence[int]) -> Steers:
-        """Return the decoding of some of the prompts."""
+        """Return the steering of some of the prompts."""
         ...
 
     def applied(self, model: Any) -> AbstractContextManager[None]:
-        """Steer the passes made inside."""
+        """Steer the model's passes inside the context."""
         ...
 
 
-def steered(steering: Steers | None, model: Decodes) -> AbstractContextManager[None]:
-    """Return the steering, or nothing."""
+def steering_context(steering: Steers | None, model: DecodingModel) -> AbstractContextManager[None]:
+    """Return the steering's context, or one that does nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 
 def decode(
-    model: Decodes,
+    model: DecodingModel,
     prompts: Sequence[Prompt],
     max_new_tokens: int,
     sampling: Sampling | None,
     steering: Steers | None,
     stopped: Callable[[], bool],
 ) -> tuple[list[list[int]], list[dict[int, float]]]:
-    """Return the tokens behind each prompt, those behind an answer's end included, and the log-probabilities of its
-    first place; greedy unless sampling is given."""
+    """Return the tokens after each prompt, including those after an answer's end, and first-token log-probabilities.
+
+    Decoding is greedy unless sampling is given.
+    """
     import torch
 
     transformers, pad = load_transformers(), model.network.generation_config.pad_token_id
     inputs: dict[str, Any] = model.placed(collate(prompts, pad))
     first = _FirstToken()
     processors = [first, SeededNucleus(sampling)] if sampling else [first]
-    with torch.inference_mode(), steered(steering, model):
+    with torch.inference_mode(), steering_context(steering, model):
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,
@@ -69,10 +71,10 @@ def decode(
 
 
 class _FirstToken:
-    """A logits processor of transformers that keeps the likeliest tokens of the first place, and changes nothing."""
+    """A transformers logits processor that records the likeliest first tokens, and changes nothing."""
 
     def __init__(self) -> None:
-        self.likeliest: list[dict[int, float]] = []  # token to log-probability, a prompt
+        self.likeliest: list[dict[int, float]] = []  # one per prompt: token to log-probability
 
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
         if not self.likeliest:
@@ -83,7 +85,7 @@ class _FirstToken:
 
 
 class _Stopping:
-    """A stopping criterion of transformers that ends every row when asked to."""
+    """A transformers stopping criterion that ends every row on demand."""
 
     def __init__(self, asked: Callable[[], bool]) -> None:
         self._asked = asked

@@ -1,4 +1,4 @@
-"""The one place where torch and transformers are loaded, quietly and in the right order."""
+"""Load torch and transformers, quietly and in the right order. No other module does."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from traps_pipeline.base.extras import require
 
 @cache
 def load_transformers() -> Any:
-    """Return the library, told to send nothing and to say only errors. Raises TrapsError where it is not installed."""
+    """Return transformers, set to send nothing and log only errors. Raises TrapsError if it is not installed."""
     require("local")
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
-    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # the tokenizers' own threads would warn at every fork
+    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # tokenizer threads would warn at every fork
     _declare_torchvision_operators()
     transformers: Any = import_module("transformers")
     transformers.logging.set_verbosity_error()
@@ -50,14 +50,14 @@ def _declare_torchvision_operators() -> None:
         declared.define(
             "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
         )
-        _KEPT.append(declared)  # they are undone when the object goes
+        _KEPT.append(declared)  # they are removed with the object
 
 
 _KEPT: list[Any] = []
 
 
 def _torchvision_library() -> Path | None:
-    """Return the path of torchvision's compiled library without importing the package; None if there is none."""
+    """Return the path of torchvision's compiled library without importing the package; None if it is missing."""
     spec = find_spec("torchvision")
     folders = list(spec.submodule_search_locations or ()) if spec else []
     return next((path for folder in folders for path in Path(folder).glob("_C*.so")), None)

@@ -1,4 +1,4 @@
-"""A checkpoint in memory: prompts, hidden states, answers. `adapter` loads it and says what it is for."""
+"""A checkpoint in memory: prompts, hidden states and answers. `adapter` loads and identifies it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
-from traps_pipeline.models.local.decoding import Steers, decode, steered
+from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, batches
 from traps_pipeline.models.local.sampling import Sampling
@@ -26,14 +26,16 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-CLOCK_FPS = 1000  # of the time stamps given to processors: milliseconds, as exact as a frame number at any rate
-MEMORY_SHARE = 0.7  # of what is free that a batch may take by estimate
+CLOCK_FPS = 1000  # resolution of time stamps for processors: milliseconds
+MEMORY_SHARE = 0.7  # share of free memory for a batch, by estimate
 
 
 @dataclass(frozen=True)
-class Generated:
-    """An answer. finish_reason: stop, or length where `max_new_tokens` cut it off. first_token: log-probabilities of
-    the likeliest tokens of its first place."""
+class GeneratedAnswer:
+    """An answer. finish_reason: stop, or length if `max_new_tokens` cut it off.
+
+    first_token: log-probabilities of its likeliest first tokens.
+    """
 
     text: str
     prompt_tokens: int
@@ -45,32 +47,37 @@ class Generated:
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Hidden states of one prompt, float32. raw: (n_layers + 1, d_model), counted as in hidden_states, every one as it
-    leaves its block. normed: (d_model,), the last one after the final norm: the library's hidden_states[-1]."""
+    """Hidden states of one prompt, float32.
+
+    raw: (n_layers + 1, d_model), counted as in hidden_states, each as it leaves its block. normed: (d_model,), the last
+    one after the final norm: the library's hidden_states[-1].
+    """
 
     raw: np.ndarray
     normed: np.ndarray
 
 
 class LocalModel:
-    """A checkpoint in memory. device, dtype, quantisation: as the entry says, never changed."""
+    """A checkpoint in memory. device, dtype, quantisation: as in the entry, never changed."""
 
     def __init__(self, network: Any, processor: Any, checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
         self.network, self.processor, self.checkpoint, self.params, self.device = (
             network, processor, checkpoint, params, device,
         )  # fmt: skip
-        self.inputs_device = str(network.device) if device == SPREAD else device  # of the embeddings
+        self.inputs_device = str(network.device) if device == SPREAD else device  # device of the embeddings
         self.dtype, self.quantisation = params.dtype, params.quantisation
         self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
         self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)
         self.clips = ClipMemory()
-        self._processing = Lock()  # tokenizers are not for several threads at once
+        self._processing = Lock()  # tokenizers are not thread-safe
         network.generation_config = self._plain_generation()
 
     def _plain_generation(self) -> Any:
-        """Return only what ends an answer and what is no text: a checkpoint's own top_k or repetition penalty would
-        else be applied unasked. Placeholders of pictures are no text: an answer that held one could not be read
-        again."""
+        """Return generation settings with only the end of an answer and the suppressed tokens.
+
+        A checkpoint's own top_k or repetition penalty would otherwise apply unasked. Placeholders of pictures are
+        suppressed: an answer that contained one could not be tokenized again.
+        """
         own, tokenizer = self.network.generation_config, self.processor.tokenizer
         eos = own.eos_token_id if own.eos_token_id is not None else tokenizer.eos_token_id
         if eos is None:
@@ -90,7 +97,7 @@ class LocalModel:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What decides hidden states besides the prompt, for keys; where checkpoint and model are is not in it."""
+        """The properties that decide hidden states besides the prompt, for keys, without paths or device."""
         return {
             "checkpoint_digest": self.checkpoint.digest,
             "class": type(self.network).__name__,
@@ -104,13 +111,13 @@ class LocalModel:
 
     @property
     def served_model(self) -> str:
-        """What answered, for the ledger: checkpoint and digest, precision, and the device that it ran on."""
+        """The model's name in the ledger: checkpoint and digest, precision, and device."""
         precision = self.dtype if self.quantisation == "none" else f"{self.quantisation}/{self.dtype}"
         return f"{self.checkpoint.name}@{self.checkpoint.digest[:12]} {precision} on {self.device_name}"
 
     @property
     def device_name(self) -> str:
-        """The device as the entry says, of a GPU with its name."""
+        """The device as in the entry, with the name of a GPU."""
         if not self.device.startswith("cuda"):
             return self.device
         import torch
@@ -118,7 +125,7 @@ class LocalModel:
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def block(self, layer: int) -> Module:
-        """Return the block whose output is hidden_states[layer]. Raises TrapsError for a layer that is out of range."""
+        """Return the block whose output is hidden_states[layer]. Raises TrapsError for a layer out of range."""
         if not 1 <= layer <= self.n_layers:
             raise TrapsError(
                 f"{self.checkpoint.name}: no block {layer}; it has blocks 1 to {self.n_layers} (layer 0 are the "
@@ -132,7 +139,7 @@ class LocalModel:
         """Return system prompt, then clip and question, nothing else (docs/spec.md 3.3).
 
         frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
-        time stamps get exactly. Raises TrapsError when the chat template loses a part.
+        time stamps get exactly. Raises TrapsError if the chat template loses a part.
         """
         text = self._rendered(system, user)
         marks = [round(1000 * float(time)) for time in times_s]
@@ -166,14 +173,14 @@ class LocalModel:
             )
         return text
 
-    def remembering_clips(self) -> AbstractContextManager[None]:
-        """Let the vision tower see each clip once within the block (`clips`)."""
+    def caching_clips(self) -> AbstractContextManager[None]:
+        """Cache the vision tower's output per clip within the block (`clips`)."""
         return self.clips.remembering(self.network)
 
     # --- hidden states ------------------------------------------------------------------------------------------------
 
     def forward(self, prompt: Prompt) -> Any:
-        """Return one bare pass over a prompt, without logits; returns the library's output. No gradients."""
+        """Run one bare pass over a prompt, without logits or gradients; return the library's output."""
         import torch
 
         with torch.inference_mode():
@@ -186,25 +193,24 @@ class LocalModel:
         steering: Steers | None = None,
         chosen: np.ndarray | None = None,
     ) -> States:
-        """Return the hidden states of every layer, of one prompt: batch size 1, so that in 16 bits no other prompt
-        matters.
+        """Return the hidden states of one prompt at every layer.
 
-        chosen: for poolings over a part of the prompt, its tokens (T,) bool. `answer` generates the first token of the
-        greedy answer, and takes the state at it.
+        The batch size is 1, so that in 16 bits no other prompt matters. chosen: for poolings over a part of the prompt,
+        its tokens (T,) bool. `answer` generates the first token of the greedy answer, and takes the state at it.
         """
         import torch
 
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
             prompt = self._answered(prompt, steering)
-        with steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
+        with steering_context(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
             self.forward(prompt)
         assert captured.normed is not None and len(captured.raw) == self.n_layers + 1
         rows = torch.stack([row.float().cpu() for row in (*captured.raw, captured.normed)]).numpy()
         return States(rows[:-1], rows[-1])
 
     def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
-        """Return the prompt with the first token of its greedy answer behind it."""
+        """Return the prompt followed by the first token of its greedy answer."""
         return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
     # --- answers ------------------------------------------------------------------------------------------------------
@@ -217,14 +223,14 @@ class LocalModel:
         steering: Steers | None = None,
         *,
         stopped: Callable[[], bool] = lambda: False,
-    ) -> list[Generated]:
-        """Return an answer to each prompt, in order; greedy unless sampling is given. Batches are sized to memory, and
-        halved where that was too much; no answer depends on them but through rounding in 16 bits.
+    ) -> list[GeneratedAnswer]:
+        """Return an answer to each prompt, in order; greedy unless sampling is given.
 
-        sampling, steering: one row a prompt. stopped: asked at every token, ends early. Raises TrapsError when one
-        prompt alone does not fit.
+        Batches are sized to memory, and halved after an out-of-memory error; answers depend on them only through
+        rounding in 16 bits. sampling, steering: one row per prompt. stopped: called at every token, ends generation
+        early. Raises TrapsError if a single prompt does not fit.
         """
-        answers: dict[int, Generated] = {}
+        answers: dict[int, GeneratedAnswer] = {}
         each = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
         for group in batches(prompts, each, MEMORY_SHARE * free_bytes(self.device)):
             pending = [group]
@@ -246,7 +252,7 @@ class LocalModel:
         sampling: Sampling | None,
         steering: Steers | None,
         stopped: Callable[[], bool],
-    ) -> list[Generated] | None:
+    ) -> list[GeneratedAnswer] | None:
         """Return the answers of a batch; None if it must be halved."""
         import torch
 
@@ -262,7 +268,7 @@ class LocalModel:
                     f"{prompts[rows[0]].n_tokens} tokens and {max_new_tokens} new ones: free memory, show fewer frames "
                     "or use a larger device"
                 ) from None
-        torch.cuda.empty_cache()  # outside the handler: the failed pass is freed by now
+        torch.cuda.empty_cache()  # outside the handler, where the failed pass has been freed
         progress.current().note(f"{self.checkpoint.name}: {len(rows)} rows do not fit into memory, trying half of them")
         return None
 
@@ -278,10 +284,10 @@ class LocalModel:
                 name = self.processor.tokenizer.decode([token])
                 named[name] = float(np.logaddexp(named.get(name, -np.inf), logprob))
         finish = "length" if ended is None else "stop"
-        return Generated(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
+        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return inputs of a prompt or a batch, on the model's device, pictures in its precision."""
+        """Return inputs of a prompt or a batch on the model's device, pictures in its precision."""
         dtype, device = self.network.dtype, self.inputs_device
         return {
             name: value.to(device, dtype) if value.is_floating_point() else value.to(device)
@@ -289,17 +295,16 @@ class LocalModel:
         }
 
     def _row_bytes(self, prompt: Prompt, max_new_tokens: int) -> float:
-        """Return memory that a row takes at most, by estimate: keys and values, the widest activations, pictures,
-        logits."""
+        """Return an upper estimate of a row's memory: keys and values, the widest activations, pictures, logits."""
         item, vocabulary = self.network.dtype.itemsize, self.network.config.get_text_config().vocab_size
         cache = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
-        passing = 28 * prompt.n_tokens * self.d_model * item  # a block's widest moment: residual, gate, up and down
+        passing = 28 * prompt.n_tokens * self.d_model * item  # a block's peak: residual, gate, up and down
         pictures = 8 * sum(value.numel() for value in prompt.inputs.values() if value.is_floating_point()) * item
         return cache + passing + pictures + 6 * vocabulary * 4
 
     @cached_property
     def _cached_width(self) -> int:
-        """Numbers that a token leaves in the cache, over all blocks; blocks that share another's leave none."""
+        """Cached numbers per token, over all blocks; blocks that share another's cache add none."""
         names = ("k_proj", "v_proj")
         widths = [module.out_features for name, module in self.blocks.named_modules() if name.endswith(names)]
         return sum(widths) or 2 * self.n_layers * self.d_model
@@ -310,9 +315,7 @@ def _first(tokens: int | Sequence[int]) -> int:
 
 
 def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:
-    """Return blocks and final norm of the language model. Raises TrapsError for a model that is built in another
-    way.
-    """
+    """Return blocks and final norm of the language model. Raises TrapsError for another architecture."""
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks, norm = getattr(decoder, "layers", None), getattr(decoder, "norm", None)
     expected = getattr(network.config.get_text_config(), "num_hidden_layers", None)

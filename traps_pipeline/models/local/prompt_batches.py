@@ -1,4 +1,4 @@
-"""Prompts as a model reads them, and how they are put together into batches. No model is needed for either."""
+"""Processed prompts, and their batching. Neither needs a model."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """A prompt as the model reads it. text: rendered by the chat template, before the clip is expanded. inputs: what
-    the processor made, on the CPU, each with a first axis of one prompt (or of its patches or frames)."""
+    """A processed prompt. text: rendered by the chat template, before the clip is expanded.
+
+    inputs: the processor's output, on the CPU, each with a first axis of one prompt (or of its patches or frames).
+    """
 
     text: str
     inputs: Mapping[str, Tensor]
 
     @property
     def n_tokens(self) -> int:
-        """Tokens of the prompt, those of the clip included."""
+        """The number of tokens, those of the clip included."""
         return self.inputs["input_ids"].shape[1]
 
     @property
     def sequences(self) -> list[str]:
-        """Names of the inputs that have one value a token."""
+        """Names of the inputs with one value per token."""
         return [name for name, value in self.inputs.items() if value.shape == self.inputs["input_ids"].shape]
 
     def followed_by(self, tokens: Sequence[int]) -> Prompt:
-        """Return the prompt with tokens of an answer behind it."""
+        """Return the prompt followed by tokens of an answer."""
         import torch
 
         inputs = dict(self.inputs)
@@ -42,13 +44,13 @@ class Prompt:
 
     @property
     def form(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
-        """What prompts must share to go into one batch: the shapes of the clip's tensors but for the first axis."""
+        """The shapes that prompts of one batch must share: those of the clip's tensors except the first axis."""
         clip = sorted(self.inputs.keys() - set(self.sequences))
         return tuple((name, tuple(self.inputs[name].shape[1:])) for name in clip)
 
 
 def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
-    """Return one batch: what has a value a token is padded on the left, the rest is put one after another."""
+    """Return one batch: pad sequences on the left, and concatenate other inputs."""
     import torch
 
     width = max(prompt.n_tokens for prompt in prompts)
@@ -63,9 +65,7 @@ def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
 
 
 def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
-    """Yield indices of prompts that go together: of one form, of similar length, as many as fit into the room
-    (bytes).
-    """
+    """Yield indices of prompts to batch: of one form, of similar length, as many as fit into the room (bytes)."""
     by_form: defaultdict[Any, list[int]] = defaultdict(list)
     for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):
         by_form[prompts[i].form].append(i)

@@ -1,5 +1,4 @@
-"""Sampling in which every row has its own stream of random numbers, so that an answer depends on its own seed alone and
-not on the batch that it was generated in."""
+"""Sample with a random stream per row, so that an answer depends on its own seed and not on its batch."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Temperature and nucleus sampling, with one seed a prompt."""
+    """Temperature and nucleus sampling, with one seed per prompt."""
 
     temperature: float
     top_p: float
@@ -27,7 +26,7 @@ class Sampling:
 
 
 class SeededNucleus:
-    """A logits processor of transformers: leaves one token a row possible, drawn from the row's own stream.
+    """A transformers logits processor that leaves one token per row possible, drawn from the row's own stream.
 
     Greedy decoding then picks that token. The nucleus is the smallest set of tokens whose probability reaches top_p.
     """
@@ -37,7 +36,7 @@ class SeededNucleus:
         self._streams = [np.random.default_rng(seed) for seed in sampling.seeds]
 
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
-        """Scale and cut logits for sampling. scores: (rows, vocabulary) logits; the same shape comes back."""
+        """Mask all logits except the sampled token's. scores: (rows, vocabulary); the same shape is returned."""
         import torch
 
         probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)

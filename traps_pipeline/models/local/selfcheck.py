@@ -1,4 +1,4 @@
-"""What `traps doctor --local` looks at: whether each family's real classes work here, on a tiny checkpoint."""
+"""Check each family's real classes on a tiny checkpoint (`traps doctor --local`)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ _NF4_SKIP = ("model.visual", "lm_head")
 
 
 def tiny_model(family: Family, folder: Path, quantisation: Quantisation = "none") -> LocalModel:
-    """Return a tiny checkpoint of a family in a folder, where it is built unless it is there, loaded by the real
-    classes."""
+    """Return a family's tiny checkpoint from a folder, loaded by the real classes; build it if it is missing."""
     build_tiny(family, folder)
     params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": quantisation}
     params |= {"do_sample": False, "max_new_tokens": 8, "nf4_skip": _NF4_SKIP if quantisation == "nf4" else ()}
@@ -41,9 +40,9 @@ def _prompt(model: LocalModel, folder: Path) -> Prompt:
 
 
 def check_family(family: Family, folder: Path) -> str:
-    """Build, save, reload, answer a clip. Returns what was seen.
+    """Build, save and reload a checkpoint, and answer a clip. Return the observation in words.
 
-    Raises TrapsError, or whatever the library raises, when something is not as it should be.
+    Raises TrapsError, or any error of the library, if a step fails.
     """
     model = tiny_model(family, folder / family)
     (answer,) = model.generate([_prompt(model, folder)], 8)
@@ -51,7 +50,7 @@ def check_family(family: Family, folder: Path) -> str:
 
 
 def check_nf4(folder: Path) -> str:
-    """Load a tiny checkpoint in 4 bits, where the libraries for it are installed. Returns what was seen."""
+    """Load a tiny checkpoint in 4 bits, if the libraries for it are installed. Return the observation in words."""
     if absent := missing("nf4"):
         return f"{' and '.join(absent)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     model = tiny_model("qwen3-vl", folder / "nf4", "nf4")
@@ -62,7 +61,7 @@ def check_nf4(folder: Path) -> str:
 
 
 def describe_devices() -> str:
-    """Return which devices torch finds."""
+    """Return the devices that torch finds, in words."""
     import torch
 
     versions = f"torch {torch.__version__}, transformers {load_transformers().__version__}"
@@ -75,7 +74,7 @@ def describe_devices() -> str:
 
 
 def describe_checkpoints() -> str:
-    """Return which local models of the registry have their weights here."""
+    """Return the local models of the registry whose weights are present, in words."""
     return "; ".join(_whereabouts(entry) for entry in load_models().values() if entry.backend == LOCAL)
 
 

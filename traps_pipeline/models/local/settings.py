@@ -1,4 +1,4 @@
-"""What an entry of the registry says about a local model; nothing heavy is imported here."""
+"""A local model's settings in the registry, without heavy imports."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Dtype = Literal["float32", "bfloat16", "float16"]
 Quantisation = Literal["none", "nf4"]
-SPREAD = "auto"  # device of a model that is spread over all GPUs of the process, or lies on the CPU without any
+SPREAD = "auto"  # device: spread over all GPUs of the process, or on the CPU without any
 DEVICE = r"^(cpu|mps|auto|cuda(:\d+)?)$"
 
 
 class LocalParams(BaseModel):
-    """`params` of an entry with backend local: all of it decides an answer, so all of it is in the ledger key.
+    """`params` of an entry with backend local: everything here decides an answer and is in the ledger key.
 
     checkpoint: hub id, or a folder (absolute, or relative to the checkout). revision: the hub's commit. template:
-    variables of the chat template. video: options of the checkpoint's video processor. nf4_skip: modules left as they
-    are; by default the library chooses.
+    variables of the chat template. video: options of the checkpoint's video processor. nf4_skip: modules left
+    unquantised; by default the library chooses.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -56,9 +56,9 @@ class NetworkSize(BaseModel):
 
 
 class MechanismSpec(BaseModel):
-    """How a model is loaded to look inside (docs/spec.md 7.1), where that differs from how it answers.
+    """Overrides for loading a model for mechanistic analyses (docs/spec.md 7.1).
 
-    quantisation, with its nf4_skip: None is that of `params`.
+    quantisation, with its nf4_skip: None means that of `params`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -72,7 +72,7 @@ class MechanismSpec(BaseModel):
         return self
 
     def inside(self, params: LocalParams) -> LocalParams:
-        """Return the parameters that the model is looked into with."""
+        """Return the parameters for mechanistic analyses."""
         if self.quantisation in (None, params.quantisation) and not self.nf4_skip:
             return params
         return params.model_copy(update={"quantisation": self.quantisation, "nf4_skip": self.nf4_skip})

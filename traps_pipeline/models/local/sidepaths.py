@@ -1,9 +1,9 @@
-"""What blocks read of earlier ones besides the residual stream and their own keys and values.
+"""Inputs of a block from earlier ones besides the residual stream and its own keys and values.
 
-Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks make no keys and values: each reads
-those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block adds a
-vector of its own that is made of the token and its embedding (`per_layer_input`). So a state at block l does not say
-what blocks behind l make of it: a patch there replaces both as well.
+Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks compute no keys and values: each
+reads those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block
+adds its own vector computed from the token and its embedding (`per_layer_input`). So a state at block l does not
+determine the output of later blocks: a patch there replaces both as well.
 
 Qwen3-VL's deepstack features, which are added between blocks, are inputs of its decoder: `mechanism.patching_effects`
 replaces them there.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Argument = Literal["shared_kv_states", "per_layer_input"]
 SHARED: Argument = "shared_kv_states"
 PER_LAYER: Argument = "per_layer_input"
-# By field of a configuration: the argument in which its blocks are given what it stands for, and that in words.
+# By configuration field: the blocks' argument for this path, and a description.
 _FIELDS: dict[str, tuple[Argument | None, str]] = {
     "num_kv_shared_layers": (SHARED, "later blocks reuse keys and values of earlier ones"),
     "hidden_size_per_layer_input": (PER_LAYER, "every block reads the token's own embedding again"),
@@ -31,25 +31,27 @@ _FIELDS: dict[str, tuple[Argument | None, str]] = {
 
 
 def unknown_path(config: Any, block: Module) -> str | None:
-    """Return which path of a language model's configuration is in none of its blocks' known arguments, in words and by
-    the name of its field; None if there is no such path."""
+    """Return a path of the model's configuration that no known argument of its blocks covers.
+
+    The path is described in words and by the name of its field; None if there is none.
+    """
     for field, (argument, what) in _FIELDS.items():
         if getattr(config, field, 0) and argument not in _arguments(type(block)):
             return f"{what} ({field})"
     return None
 
 
-def given(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Return what a call of a block gives it as an argument; None if it has no such argument or is given none."""
+def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Return a call's argument of a block; None if the block lacks it or the call omits it."""
     names = _arguments(type(block))
     place = names.index(name) if name in names else len(args)
     return args[place] if place < len(args) else kwargs.get(name)
 
 
-def giving(
+def with_argument(
     block: Module, name: Argument, value: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return the arguments of a call of a block with another value for one of them."""
+    """Return the arguments of a call of a block with one of them replaced."""
     place = _arguments(type(block)).index(name)
     if place < len(args):
         return (*args[:place], value, *args[place + 1 :]), kwargs

@@ -1,7 +1,7 @@
-"""Which tokens of a prompt are what: system prompt, time stamps, visual tokens, question, the last one.
+"""Locate the parts of a prompt: system prompt, time stamps, visual tokens, question, the last token.
 
-Nothing here knows a family. Visual tokens are those of the processor's own placeholders. The rest is found by its text:
-tokens are decoded one by one, blanks are left out on both sides (tokenizers write them differently), and a token
+Nothing here depends on a family. Visual tokens are those of the processor's own placeholders. The rest is found by its
+text: tokens are decoded one by one, blanks are ignored on both sides (tokenizers write them differently), and a token
 belongs to a part if any of its characters does.
 """
 
@@ -19,14 +19,17 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 PARTS = ("system", "stamps", "visual", "question", "last")
-CHANGED = 0.05  # mean absolute difference of a visual token's pixels, as the model reads them, that is a change
+CHANGED = 0.05  # minimum mean absolute difference of a changed visual token's pixels, as the model reads them
 # `<0.4 seconds>` of Qwen3-VL and `00:01` of Gemma 4; LLaVA-NeXT-Video writes no times.
 _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
 
 def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
-    """Return, by part, whether each token of the prompt belongs to it, (T,) bool. No token belongs to two parts; those
-    of the chat template belong to none. Raises TrapsError where a part cannot be found."""
+    """Return, by part, whether each token of the prompt belongs to it, (T,) bool.
+
+    No token belongs to two parts; those of the chat template belong to none. Raises TrapsError if a part cannot be
+    found.
+    """
     ids, visual = prompt.inputs["input_ids"][0].tolist(), visual_tokens(model, prompt)
     texts = [
         "" if is_visual else _plain(model.processor.tokenizer.decode([token]))
@@ -67,7 +70,7 @@ def visual_tokens(model: LocalModel, prompt: Prompt) -> np.ndarray:
 def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray | None:
     """Return the visual tokens (T,) of a prompt whose pixels differ from those of another one, (T,) bool.
 
-    None where the clips do not give as many pixels, or the processor's pixels do not come token by token. Qwen's do:
+    None if the clips have different numbers of pixels, or the processor's pixels do not come token by token. Qwen's do:
     the patches that are merged into one token follow each other.
     """
     pixels, n_visual = [prompt.inputs.get("pixel_values_videos") for prompt in (one, other)], int(visual.sum())

@@ -26,10 +26,10 @@ Overrides = Mapping[str, Any]
 
 _HEADS = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
 _TEXT: dict[str, Any] = {"hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 4, **_HEADS}
-# Standard deviation of the text weights of a random checkpoint: such that every token of a prompt tells in the answer.
+# Standard deviation of a random checkpoint's text weights, large enough for every prompt token to affect the answer.
 _SPREAD: dict[Family, float] = {"qwen3-vl": 0.2, "gemma-4": 0.02, "llava-next-video": 0.2}
 _VISION_SIZE = 32  # hidden size of the vision towers
-_STILL_PIXELS = 128 * 96  # of an image: as many as the frames that the pocket model is trained with have
+_STILL_PIXELS = 128 * 96  # pixels of an image: those of the pocket model's training frames
 
 # Special tokens by the name under which the family's processor looks them up; `pad` and `eos` are in all of them.
 _SPECIAL: dict[Family, dict[str, str]] = {
@@ -58,7 +58,7 @@ _SPECIAL: dict[Family, dict[str, str]] = {
     "llava-next-video": {"pad": "<pad>", "eos": "</s>", "bos": "<s>", "image": "<image>", "video": "<video>"},
 }
 
-# In the form of the families' own: system, then the clip, then the question, and the words that begin an answer.
+# Like the families' own: system, then the clip, then the question, and the beginning of an answer.
 _PARTS = "{%- for part in message['content'] -%}"
 _TEMPLATES: dict[Family, str] = {
     "qwen3-vl": (
@@ -95,9 +95,8 @@ def build_tiny(
 ) -> Path:
     """Write a random checkpoint of the family's real class into a folder and return the folder.
 
-    tokenizer: of the `tokenizers` library, in the place of bytes; the family's special tokens are added to it. text,
-    vision: fields of the two configurations. video: fields of the video processor. The same arguments give the same
-    weights.
+    tokenizer: of the `tokenizers` library, instead of bytes; the family's special tokens are added to it. text, vision:
+    fields of the two configurations. video: fields of the video processor. The same arguments give the same weights.
     """
     import torch
 
@@ -115,8 +114,7 @@ def build_tiny(
 
 
 def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
-    """Return a tokenizer of transformers with the family's special tokens after those that it has; by default one a
-    byte."""
+    """Return a transformers tokenizer with the family's special tokens added; default: one token per byte."""
     transformers = load_transformers()
     special = _SPECIAL[family]
     base = _byte_level() if tokenizer is None else tokenizer
@@ -140,7 +138,7 @@ def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
 
 
 def _byte_level() -> Tokenizer:
-    """Return every byte of a text is a token: any text can be read and written."""
+    """Return a tokenizer with one token per byte, which can read and write any text."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers
 
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
@@ -151,7 +149,7 @@ def _byte_level() -> Tokenizer:
 
 
 def make_config(family: Family, tokenizer: Any, text: Overrides | None = None, vision: Overrides | None = None) -> Any:
-    """Return the family's configuration for a tokenizer of `make_tokenizer`: tiny, but for what is overridden."""
+    """Return the family's configuration for a tokenizer of `make_tokenizer`: tiny, except for overridden fields."""
     transformers = load_transformers()
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _SPECIAL[family].items()}
     shared = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
@@ -200,7 +198,7 @@ def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: O
     words = {
         **base,
         "vocab_size_per_layer_input": base["vocab_size"],
-        "hidden_size_per_layer_input": 64,  # of 64: what NF4 needs on a CPU
+        "hidden_size_per_layer_input": 64,  # a multiple of 64, as NF4 needs on a CPU
         "global_head_dim": 32,
         "num_hidden_layers": 6,
         "num_kv_shared_layers": 2,
@@ -257,8 +255,7 @@ def _llava_next_video(
 
 
 def make_processor(family: Family, tokenizer: Any, video: Overrides | None = None) -> Any:
-    """Return the family's processor around a tokenizer of `make_tokenizer`; `video` overrides its video processor's
-    fields."""
+    """Return the family's processor for a tokenizer of `make_tokenizer`; `video` overrides fields of its video part."""
     transformers = load_transformers()
     video_settings = dict(video or {})
     match family:
@@ -268,7 +265,7 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
             still = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
             still["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
             return transformers.Qwen3VLProcessor(
-                image_processor=transformers.Qwen2VLImageProcessor(**still),  # a server may be sent frames one by one
+                image_processor=transformers.Qwen2VLImageProcessor(**still),  # a server may receive frames one by one
                 tokenizer=tokenizer,
                 video_processor=eyes,
                 chat_template=_TEMPLATES[family],

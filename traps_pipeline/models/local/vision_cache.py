@@ -1,9 +1,10 @@
-"""What the vision tower makes of a clip, kept: looking inside a model shows it the same clip under several prompts, and
-steering shows it again for every direction and dose.
+"""Cache the vision tower's output per clip.
 
-The three families say in their own ways which pixels are of which clip (`_clips_of`); a class that says it in none of
-them runs as it is. A clip is known by the bytes of its pixels and its grid, so that a re-rendered clip is another one.
-Whoever changes the weights of a vision tower in memory must give the model a new `ClipMemory`.
+Mechanistic analyses show a model the same clip under several prompts, and steering again for every direction and dose.
+
+The three families say in their own ways which pixels belong to which clip (`_clips_of`); other classes run uncached. A
+clip is identified by the bytes of its pixels and its grid, so that a re-rendered clip is another one. Code that changes
+the weights of a vision tower in memory must give the model a new `ClipMemory`.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-MOST_BYTES = 2 * 2**30  # of features that are kept, on the model's device
+MOST_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's device
 
 
 @dataclass(frozen=True, eq=False)
 class _Features:
-    """Of one clip: what enters the decoder as tokens, and what is added behind its first blocks, by place."""
+    """A clip's features: decoder tokens, and additions after its first blocks, by place."""
 
     tokens: Tensor
     deepstack: tuple[Tensor, ...]
@@ -47,8 +48,10 @@ class ClipMemory:
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
-        """Let a network's vision tower see each clip once within the block. What it returns is what it returned then.
-        Inside another such context nothing changes."""
+        """Let a network's vision tower process each clip once within the block, and cache its output.
+
+        Nested contexts change nothing.
+        """
         owner = network.base_model
         original = getattr(owner, "get_video_features", None)
         if original is None or "get_video_features" in vars(owner):
@@ -56,7 +59,7 @@ class ClipMemory:
             return
         names = inspect.signature(original)
 
-        @functools.wraps(original)  # the library looks at the names of its arguments
+        @functools.wraps(original)  # the library inspects the names of its arguments
         def features(*given: Any, **named: Any) -> Any:
             arguments = dict(names.bind(*given, **named).arguments)
             rest = arguments.pop("kwargs", {})
@@ -74,7 +77,7 @@ class ClipMemory:
         try:
             yield
         finally:
-            del owner.get_video_features  # the class's own method is found again
+            del owner.get_video_features  # restore the class's own method
 
     def _pass(self, original: Any, key: str, arguments: dict[str, Any]) -> _Features:
         output = original(**arguments)
@@ -87,7 +90,7 @@ class ClipMemory:
         return features
 
     def _joined(self, rows: list[_Features]) -> Any:
-        """Return what the library returns of these clips together."""
+        """Return these clips' features in the form of the library's output."""
         import torch
 
         make, is_tuple = self._form
@@ -108,7 +111,7 @@ class ClipMemory:
 
 
 def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
-    """Return the arguments of each clip alone; None where a class does not say which pixels are whose."""
+    """Return the arguments of each clip alone; None if the class does not separate clips."""
     pixels, grids = arguments["pixel_values_videos"], arguments.get("video_grid_thw")
     if grids is not None:  # Qwen3-VL: patches of all clips one after the other, and how many each has
         parts = pixels.split(grids.prod(-1).tolist())

@@ -10,7 +10,13 @@ from traps_pipeline.benchmark import filmed_arms, stored_evidence
 from traps_pipeline.benchmark import videos as clips
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.items import build_items
-from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
+from traps_pipeline.benchmark.specs import (
+    build_specs,
+    corrections_version,
+    released_version,
+    seconds_left,
+    unsettled_outcomes,
+)
 from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.pipeline.stage import is_declared, of, source, stage
@@ -19,7 +25,9 @@ from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VI
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-RENDERS = RunResources(memory_gb=0.6, each_gb=0.4)  # measured: 0.4 GB of the process, 0.35 of each that draws
+RENDERS = RunResources(
+    memory_gb=0.6, each_gb=0.4
+)  # measured: 0.4 GB for the process, 0.35 GB for each rendering worker
 _stage = partial(stage, group="benchmark")
 _source = partial(source, group="benchmark", kinds=["json"], scheme=CATEGORY)
 category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
@@ -54,7 +62,7 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
             "outcome_settled",
             "In the replay of the frozen trajectory, every outcome is the ground truth, is settled in time, and has "
             "the margin in its record.",
-            lambda workspace, key, output: unsettled(output.beside),
+            lambda workspace, key, output: unsettled_outcomes(output.beside),
         ),
         Check(
             "control_certified",
@@ -87,8 +95,10 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
     ],
 )
 def scene_specs(workspace: Workspace, category: str) -> StageOutput:
-    """Return scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated
-    here, once."""
+    """Return scenarios of a category after corrections, one row each.
+
+    A scenario with corrected parameters is simulated here, once.
+    """
     rows, resolved = build_specs(workspace, category)
     return StageOutput(rows, beside=resolved)
 
@@ -122,8 +132,10 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
     ],
 )
 def videos(workspace: Workspace, category: str) -> StageOutput:
-    """Return control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
-    whichever of the processes that are at it."""
+    """Return control and void clips of a category, one row each.
+
+    Each clip is rendered once, from its frozen trajectory, by one of the processes working on the category.
+    """
     rows, leaks = clips.build_videos(workspace, category)
     return StageOutput(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
 

@@ -50,7 +50,7 @@ def judges(workspace: Workspace, _: None) -> str:
 def _with_items(
     workspace: Workspace, cells: Iterator[tuple[Cell, StageOutput]]
 ) -> Iterator[tuple[str | None, StageOutput]]:
-    """Add a cell's items to what is shown of it."""
+    """Add a cell's items to the metadata of its partition."""
     for cell, output in cells:
         items_shown = _items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], output.content))
         yield cell.key, StageOutput(output.content, output.tally, {**output.shown, **items_shown})
@@ -59,10 +59,10 @@ def _with_items(
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
     """Return metadata about a cell's items: a table of those without an answer, and the explorer's view of all."""
     from traps_pipeline.report.cards import explorer_address
-    from traps_pipeline.report.writing import Behind
+    from traps_pipeline.report.writing import SourceItems
 
     e = cell.evaluation
-    page, _, view = explorer_address(Behind(cell.dataset, e.model, e.regime)).partition("#")
+    page, _, view = explorer_address(SourceItems(cell.dataset, e.model, e.regime)).partition("#")
     columns = ("item_id", "side", "outcome", "error", "attempts")
     without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
     records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
@@ -86,7 +86,7 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
     side_by_side=True,
 )
 def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return a model's answers under a regime in a run, one row per item; those in the ledger are not asked again."""
+    """Return a model's answers under a regime in a run, one row per item; answers in the ledger are reused."""
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 

@@ -29,7 +29,7 @@ from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
-    from traps_pipeline.mechanism.stored import StoredStates
+    from traps_pipeline.mechanism.stored_states import StoredStates
 
 _source = partial(source, group=GROUP, kinds=["yaml"], scheme=EXTRACTION)
 _stage = partial(stage, group=GROUP, scheme=EXTRACTION, cost="machine")
@@ -60,28 +60,28 @@ def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
 
 def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
     """Return the model of an extraction, and its stored states."""
-    from traps_pipeline.mechanism.stored import StoredStates
+    from traps_pipeline.mechanism.stored_states import StoredStates
 
     model, extraction = _model(workspace, key)
     return model, StoredStates.of(workspace, extraction)
 
 
 @_stage(
-    tables.PROBE_BASELINES,  # on the machine, since the output margin needs the model's head
+    tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
     code="2",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
-    """Return the probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
+    """Return the probing protocol on raw inputs, on the model's output margin and on noise instead of states."""
     from traps_pipeline.mechanism.baselines import baseline_rows
 
     return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
 
 
 def _gated(partitions: StudyPartitions, key: str) -> bool:
-    """Return whether the model of an extraction is asked, so that there are answers to gate."""
+    """Return whether the model of an extraction is also evaluated, so that a gate has answers to change."""
     extraction = Extraction.parse(key)
     evaluations = {(e.model, e.regime) for e in partitions.evaluations}
     return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in evaluations for r in PROMPTING)
@@ -97,8 +97,11 @@ _gates = partial(
 
 @_gates(tables.GATE)
 def gate(workspace: Workspace, key: str) -> StageOutput:
-    """Return the model's figures before and after a probe on its states has turned answers into abstentions, beside
-    gates on raw inputs, on the output margin and with shuffled labels."""
+    """Return the model's figures before and after a gate turns answers into abstentions.
+
+    The gate is a probe on the model's states, compared with gates on raw inputs, on the output margin and with shuffled
+    labels.
+    """
     from traps_pipeline.mechanism.gating import gate_rows
 
     return StageOutput(gate_rows(workspace, *_examined(workspace, key)))
@@ -106,7 +109,7 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
 
 @_gates(tables.RISK_COVERAGE)
 def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
-    """Return risk against coverage as gates give up answers, over the four datasets."""
+    """Return risk against coverage as a gate withholds more answers, over the four datasets."""
     from traps_pipeline.mechanism.gating import curve_rows
 
     return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
@@ -126,7 +129,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     wants=_gated,
 )
 def item_scores(workspace: Workspace, key: str) -> StageOutput:
-    """Return what states and output say of each item, by probes that have not seen its scenario, beside verdicts."""
+    """Return each item's scores from states and from output, by probes trained without its scenario, with verdicts."""
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
@@ -144,7 +147,7 @@ def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
     wants=_read_in_sentences,
 )
 def sentences(workspace: Workspace, key: str) -> StageOutput:
-    """Return how likely whole abstentions are to a model behind every item, beside its own answers."""
+    """Return the likelihood that a model gives to whole abstentions after every item, beside its own answers."""
     from traps_pipeline.mechanism.sentences import sentence_rows
 
     return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
@@ -158,7 +161,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:
     """Return indirect effects of groups of positions between matched controls and voids by layer, beside nulls."""
-    from traps_pipeline.mechanism.patched import patching_rows
+    from traps_pipeline.mechanism.patching_stage import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
 

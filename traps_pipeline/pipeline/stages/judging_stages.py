@@ -72,7 +72,7 @@ def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=asks_pairs)
 def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return PECS by the votes of two judges, for each judge that is left out."""
+    """Return PECS by the votes of two judges, for each judge left out."""
     from traps_pipeline.scoring.leave_one_out import leave_one_out as rows_of
 
     cast, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
@@ -108,8 +108,10 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
     ],
 )
 def confabulation(workspace: Workspace, _: None) -> StageOutput:
-    """Return void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no
-    such judge."""
+    """Return void failures of the sampled models, labelled on four axes by one judge.
+
+    The table is empty if the study's panel has no such judge.
+    """
     return collect_labels(workspace)
 
 

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 GROUP = "mechanism"
 _stage, _source = partial(stage, group=GROUP), partial(source, group=GROUP, kinds=["yaml"])
-# Cells in which the local models answered under Standard in run 1: their verdicts say what the models confabulated on.
+# Cells of the local models' answers under Standard in run 1: their verdicts tell confabulated voids.
 ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
 
@@ -89,8 +89,11 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
     scheme=PROBED,
 )
 def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with
-    a question that they answer, and chaotic's clips with the frame times of the other side."""
+    """Return the clips and questions for which hidden states are extracted.
+
+    These are a dataset's items, occlusion's void clips with an answerable question, and chaotic's clips with the frame
+    times of the other side.
+    """
     from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
     return StageOutput(rows_of(workspace, dataset))
@@ -116,7 +119,7 @@ def _lost_states(workspace: Workspace, key: str) -> list[str]:
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 def hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Return a frozen local model's hidden states at every layer, one row per item; only missing ones are extracted."""
+    """Return a frozen local model's hidden states at every layer, one row per item; extract only missing ones."""
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
@@ -186,8 +189,7 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
     side_by_side=True,
 )
 def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield answers of a model that is steered along every path into a dataset; answers in the ledger are not asked
-    again."""
+    """Yield answers of a model that is steered along every path into a dataset; answers in the ledger are reused."""
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
@@ -227,7 +229,7 @@ _ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
 
 @_stage(STEERING_EFFECTS, code="3", parents=_ABOVE, wants=steers)
 def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
-    """Abstention by path, kind of direction, layer, strength and side."""
+    """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
     return effect_rows(*_judged(workspace))
@@ -235,7 +237,7 @@ def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
 
 @_stage(STEERING_SHARES, code="4", parents=_ABOVE, wants=steers)
 def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
-    """Abstention over the paths of a set, with intervals by scenario."""
+    """Return abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows
 
     return share_rows(*_judged(workspace))

@@ -1,4 +1,4 @@
-"""People's labels: what they labelled, how far they agree, their row, and scores corrected by them."""
+"""People's labels: the labels themselves, their agreement, people's scores, and scores corrected by them."""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -25,13 +25,13 @@ _stage, _source = partial(stage, group="people"), partial(source, group="people"
 
 @_source(kinds=["json"])
 def people(workspace: Workspace, _: None) -> str:
-    """The labels that people gave on the pages of `traps people annotate`, as they were appended."""
+    """The labels that people gave on the pages of `traps people annotate`, in order of submission."""
     return labels_version(workspace.labels)
 
 
 @_source(kinds=["yaml"])
 def annotation_protocol(workspace: Workspace, _: None) -> str:
-    """assets/annotation.yaml: the samples that people label, and what counts as judges being split."""
+    """assets/annotation.yaml: the samples that people label, and the definition of a split panel."""
     return file_digest(PROTOCOL_FILE)[:16]
 
 
@@ -40,8 +40,10 @@ _LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, c
 
 @_stage(HUMAN_LABELS, parents=[*_LABELLED, people, annotation_protocol, judges])
 def human_labels(workspace: Workspace, _: None) -> StageOutput:
-    """Return people's labels of clips and answers that the study has, each with its item and what the panel decided;
-    empty until somebody has labelled."""
+    """Return people's labels of the study's clips and answers, each with its item and the panel's decision.
+
+    The table is empty until somebody has labelled.
+    """
     from traps_pipeline.people.labels import human_labels as rows_of
 
     return StageOutput(rows_of(workspace))
@@ -49,7 +51,7 @@ def human_labels(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(HUMAN_AGREEMENT, parents=[human_labels])
 def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return how far people agree, by task and decision."""
+    """Return the agreement between people, by task and decision."""
     from traps_pipeline.people.labels import human_agreement as rows_of
 
     return rows_of(workspace.tables.read(HUMAN_LABELS, {}))
@@ -57,7 +59,7 @@ def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(HUMAN_ROW, code="2", parents=[human_labels])
 def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return people's Acc, AbsRec, FalseAbs and PECS with intervals, their agreement, and seconds a clip."""
+    """Return people's Acc, AbsRec, FalseAbs and PECS with intervals, their agreement, and seconds per clip."""
     from traps_pipeline.people.human_scores import human_row as rows_of
 
     return rows_of(workspace.tables.read(HUMAN_LABELS, {}))
@@ -66,7 +68,7 @@ def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
 def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return all HUMAN_LABELS rows, and the VERDICTS rows of the study's panel."""
     labels = workspace.tables.read(HUMAN_LABELS, {})
-    judged = current_rows(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # they are many
+    judged = current_rows(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # verdicts are many
     own = judged.loc[judged["panel"] == panel_id(workspace.study.panel)]
     return labels, own.reset_index(drop=True)
 
@@ -76,7 +78,7 @@ _AGAINST = (human_labels, of(verdicts, need="none"), judges)
 
 @_stage(PANEL_ERRORS, code="2", parents=_AGAINST)
 def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return sensitivity and specificity of the panel against people, by task; empty while it is not validated."""
+    """Return the panel's sensitivity and specificity against people, by task; empty until it is validated."""
     from traps_pipeline.people.corrected_scores import panel_errors as rows_of
 
     return rows_of(*_labels_and_verdicts(workspace))

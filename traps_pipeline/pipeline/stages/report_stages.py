@@ -23,7 +23,7 @@ from traps_pipeline.storage.workspace import Workspace
 GROUP = "report"
 # Declared before this group, which reads their tables.
 READ = (judging_stages, people_stages, mechanism_stages, inside_stages, scoring_stages)
-NAMES = 12  # of pieces in an event
+NAMES = 12  # names of pieces listed in an event
 SCORES = ("leaderboard", "robust", "human_row", "panel_errors")  # on the page and in the explorer
 ANSWERS = ("items", "videos", "responses", "votes", "verdicts")
 _REPORTED = [name for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for name in report.reads]
@@ -42,8 +42,10 @@ def _parents(*names: str) -> list[Parent]:
 
 @_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
 def report_page(workspace: Workspace, _: None) -> StageOutput:
-    """Return findings, leaderboard, figures and tables beside the paper's on one page that opens from disk; every
-    number is a link into the explorer. A table or figure is made again only when a table that it reads changed."""
+    """Return findings, leaderboard, figures and tables, beside the paper's, on one page that opens from disk.
+
+    Every number links into the explorer. A table or figure is rebuilt only when a table that it reads changes.
+    """
     from traps_pipeline.report.cards import Card, Sources
     from traps_pipeline.report.publish import MARKDOWN, PAPER, report_files, report_parts
 

@@ -36,7 +36,7 @@ _stage = partial(stage, group="scoring")
 
 
 def asks_pairs(partitions: StudyPartitions, key: str | None) -> bool:
-    """Return whether the study asks pairs."""
+    """Return whether the study evaluates pairs."""
     return partitions.asks_pairs
 
 
@@ -81,8 +81,8 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
     return cells, current_rows(workspace, VERDICTS)
 
 
-# The panel is an input of all that is counted from its verdicts: after a change of it they are stale at once, and not
-# only when its votes are made again.
+# The panel is an input of everything computed from its verdicts, so that a change of panel makes them stale at once,
+# not only after the new votes.
 _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 
 
@@ -144,8 +144,10 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     wants=asks_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm;
-    empty if no arm was run."""
+    """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm.
+
+    The table is empty if no arm was run.
+    """
     from traps_pipeline.scoring.robust import robust as without_shortcuts
 
     judged = current_rows(workspace, VERDICTS, dataset=(*DATASETS, *ARMS))
@@ -166,8 +168,10 @@ def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Abstention and accuracy as one thing of the pairs is changed step by step, beside what rules get; empty if no
-    variation was run."""
+    """Return abstention and accuracy as one property of the pairs changes step by step, beside shortcut rules.
+
+    The table is empty if no variation was run.
+    """
     from traps_pipeline.scoring.doses import DATASETS_READ
     from traps_pipeline.scoring.doses import hypotheses as by_dose
 
@@ -193,16 +197,18 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return what every model and regime earns on graded cuts, against the true distribution over answers; empty if
-    none was asked."""
+    """Return what every model and regime earns on graded cuts, against the true distribution over answers.
+
+    The table is empty if no graded cut was run.
+    """
     from traps_pipeline.models.answer_rows import RESPONSES
-    from traps_pipeline.scoring.graded import Asked
+    from traps_pipeline.scoring.graded import GradedItem
     from traps_pipeline.scoring.graded import graded as against_posterior
     from traps_pipeline.storage.posteriors import posteriors
 
     known = posteriors(workspace)
     asked = {
-        row["item_id"]: Asked(
+        row["item_id"]: GradedItem(
             [*row["labels"]],
             json.loads(row["aliases"]),
             row["answer_type"],

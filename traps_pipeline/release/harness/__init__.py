@@ -1,5 +1,5 @@
-"""The items of a release, its panel of rules and its metric for harnesses that others use.
+"""A release's items, rule panel and metric, for other evaluation harnesses.
 
-`write.py` copies the other files of this folder, and the modules that they need, into a folder that needs nothing of
-this package; so the panel there is this one, not a second one that resembles it.
+`write.py` copies the other files of this folder, and the modules that they need, into a self-contained folder; so the
+panel there is this one, not a second one that resembles it.
 """

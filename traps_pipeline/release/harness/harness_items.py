@@ -1,4 +1,4 @@
-"""The items, prompts and frames that lie beside this file in a harness."""
+"""Read the items, prompts and frames beside this file."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def about() -> dict[str, Any]:
 
 @cache
 def items() -> list[dict[str, Any]]:
-    """Return every item: question, labels, truth, and the paths of what is shown of its clip, in order."""
+    """Return every item in order: question, labels, truth, and the paths of its media."""
     lines = (FOLDER / ITEMS).read_text(encoding="utf-8").split("\n")
     return [json.loads(line) for line in lines if line]
 
 
 def media_of(item: dict[str, Any]) -> list[Path]:
-    """Return what a model is shown: the mp4, or the JPEGs in order."""
+    """Return the paths of an item's media: the mp4, or the JPEGs in order."""
     return [FOLDER / name for name in item["media"]]
 
 

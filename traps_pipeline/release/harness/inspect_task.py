@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""The benchmark as a task of inspect_ai: `inspect eval traps_task.py -T regime=standard --model ...`."""
+"""The benchmark as an inspect_ai task: `inspect eval traps_task.py -T regime=standard --model ...`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
 from traps_pipeline.release.harness.harness_items import about, items, media_of, prompt
-from traps_pipeline.release.harness.scoring import Judged, figures, judge
+from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
 
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
 
@@ -24,7 +24,7 @@ def traps(regime: str = "standard") -> Any:
 
 
 def evaluation(regime: str) -> Any:
-    """Return all items under one regime, once: a further run is a further evaluation, as PECS is per run."""
+    """Return a task with all items under one regime, once: each run is a separate evaluation, as PECS is per run."""
     system = prompt(regime)
     samples = [
         Sample(
@@ -59,10 +59,10 @@ def _text(item: dict[str, Any]) -> Any:
 
 @metric
 def traps_figures() -> Any:
-    """Return PECS and what it is made of, overall and by dataset."""
+    """Return the metric: PECS and its factors, overall and by dataset."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        results = figures(Judged.of(one.score.metadata) for one in scores)
+        results = figures(PanelDecision.of(one.score.metadata) for one in scores)
         return {name: value for name, value in results.items() if value is not None}
 
     return compute
@@ -70,12 +70,12 @@ def traps_figures() -> Any:
 
 @scorer(metrics=[traps_figures()])
 def panel(regime: str) -> Any:
-    """Return the panel of rules: 1 for a control answered correctly and for a void abstained on."""
+    """Return the scorer: the rule panel gives 1 for a correct answer to a control and for abstention on a void."""
     known = {item["item_id"]: item for item in items()}
 
     async def score(state: Any, target: Any) -> Any:
         outcome = _OUTCOMES.get(state.output.stop_reason, "answer")
         judged = judge(known[str(state.sample_id)], outcome, state.output.completion, regime)
-        return Score(value=float(judged.right), answer=state.output.completion, metadata={**vars(judged)})
+        return Score(value=float(judged.is_right), answer=state.output.completion, metadata={**vars(judged)})
 
     return score

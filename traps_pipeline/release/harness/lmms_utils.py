@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""The benchmark as tasks of lmms-eval, one a regime: functions that the YAML files beside this one name."""
+"""The benchmark as lmms-eval tasks, one per regime: the functions named in the YAML files beside this one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
 
 from traps_pipeline.release.harness.harness_items import media_of, prompt
-from traps_pipeline.release.harness.scoring import Judged, figures, judge
+from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
 
 
 def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
@@ -26,12 +26,12 @@ def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
 
 
 def doc_to_target(doc: dict[str, Any]) -> str:
-    """Return the right answer; nothing on a void."""
+    """Return the right answer; empty on a void."""
     return doc["ground_truth"] or ""
 
 
 def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> str:
-    """Return one text, for models that take no more: the system prompt, then the question."""
+    """Return system prompt and question as one text, for models without a system prompt."""
     return f"{prompt(regime)}\n\n{doc['question']}"
 
 
@@ -47,13 +47,13 @@ def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, reg
 
 
 def _results(doc: dict[str, Any], results: list[str], *, regime: str) -> dict[str, Any]:
-    """Return the panel's decision about the answer, under the name of each figure."""
+    """Return the panel's decision about an answer, under the name of each figure."""
     judged = {**vars(judge(doc, "answer", results[0], regime)), "regime": regime}
     return dict.fromkeys((f"traps_{name}" for name in NAMES), judged)
 
 
 def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
-    return figures(Judged.of(row) for row in rows).get(name)
+    return figures(PanelDecision.of(row) for row in rows).get(name)
 
 
 NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")
@@ -62,7 +62,7 @@ pecs, acc, abs_rec, false_abs, j, missing, unread = (partial(_figure, name=name)
 
 
 def __getattr__(name: str) -> Callable[..., Any]:
-    """Return the function of a regime by the name that a task's YAML has, such as `guided_results`."""
+    """Return a regime's function by its name in a task's YAML, such as `guided_results`."""
     regime, _, kind = name.rpartition("_")
     if not regime or kind not in _BY_REGIME:
         raise AttributeError(name)

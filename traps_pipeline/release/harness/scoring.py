@@ -1,4 +1,4 @@
-"""An answer to figures, with the standard library alone: the reading of texts, the panel of rules, and PECS."""
+"""Score answers with only the standard library: read texts, apply the rule panel, and compute PECS."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ DATASETS = (
     "chaotic_ill_posed",
     "occlusion",
     "occlusion_ill_posed",
-)  # in the order in which means are summed
+)  # means are summed in this order
 RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What the panel decided about an answer. outcome: what the text amounts to, UNREAD where the rules cannot read
-    it; abstained, correct: None where nothing is decided, and correct on every void."""
+class PanelDecision:
+    """The panel's decision about an answer.
+
+    outcome: the kind of text, UNREAD if the rules cannot read it; abstained, correct: None if undecided; correct is
+    None on every void.
+    """
 
     item_id: str
     dataset: str
@@ -34,41 +37,43 @@ class Judged:
     correct: bool | None = None
 
     @property
-    def right(self) -> bool:
+    def is_right(self) -> bool:
         """Whether a control was answered correctly, or a void was abstained on."""
         return bool(self.correct if self.side == "control" else self.abstained)
 
     @staticmethod
-    def of(record: Mapping[str, Any]) -> Judged:
-        """Return inverse of `vars`."""
-        return Judged(**{name: record[name] for name in Judged.__dataclass_fields__})
+    def of(record: Mapping[str, Any]) -> PanelDecision:
+        """Return the decision from its fields (the inverse of `vars`)."""
+        return PanelDecision(**{name: record[name] for name in PanelDecision.__dataclass_fields__})
 
 
-def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> Judged:
+def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> PanelDecision:
     """Return the panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
 
-    The three seats of the panel `rules` read by the same rules, so that one reading is their majority.
+    All three judges of the panel `rules` read by the same rules, so one reading is their majority.
     """
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
     read = read_answer({**row, "text": text}, None, regime)
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
     if read.outcome not in JUDGED or read.text is None:
-        return Judged(**names, outcome=read.outcome)
+        return PanelDecision(**names, outcome=read.outcome)
     statement = read_statement(read.text, item["question"])
     if statement is None:
-        return Judged(**names, outcome=UNREAD)
+        return PanelDecision(**names, outcome=UNREAD)
     abstained = statement.value is None
     if item["side"] != "control":
-        return Judged(**names, outcome=read.outcome, abstained=abstained)
+        return PanelDecision(**names, outcome=read.outcome, abstained=abstained)
     labels, aliases = list(item["labels"]), json.loads(item["aliases"])
     correct = is_correct(statement.value, item["ground_truth"], item["answer_type"], labels, aliases)
-    return Judged(**names, outcome=read.outcome, abstained=abstained, correct=correct)
+    return PanelDecision(**names, outcome=read.outcome, abstained=abstained, correct=correct)
 
 
-def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
-    """Return Acc, AbsRec, FalseAbs, J and PECS of one run: `DATASET_FIGURE` of each dataset, and FIGURE overall, the
-    equal-weight mean over the four datasets, None unless all four are there; `missing`, items without a decision, and
-    `unread`, those of them whose text the rules could not read.
+def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
+    """Return Acc, AbsRec, FalseAbs, J and PECS of one run.
+
+    Keys: `DATASET_FIGURE` for each dataset, and FIGURE overall, the equal-weight mean over the four datasets, None
+    unless all four are present; `missing`, the number of undecided items, and `unread`, those among them that the rules
+    could not read.
     """
     rows = list(judged)
     results: dict[str, float | None] = {}
@@ -84,7 +89,7 @@ def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
     return results | {"missing": float(len(undecided)), "unread": float(sum(row.outcome == UNREAD for row in rows))}
 
 
-def _of_dataset(rows: list[Judged]) -> dict[str, float | None]:
+def _of_dataset(rows: list[PanelDecision]) -> dict[str, float | None]:
     acc = _share([row.correct for row in rows if row.side == "control"])
     false_abs = _share([row.abstained for row in rows if row.side == "control"])
     abs_rec = _share([row.abstained for row in rows if row.side == "void"])

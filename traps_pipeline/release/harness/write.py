@@ -1,4 +1,4 @@
-"""`traps publish harness`: the folder with which inspect_ai and lmms-eval evaluate models on a release."""
+"""Write the folder that lets inspect_ai and lmms-eval evaluate models on a release (`traps publish harness`)."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
 }
 
 
-def shown(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
-    """Return what is shown of a clip: the protocol's 25 frames, or evenly spaced ones. Raises TrapsError."""
+def media_settings(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
+    """Return the media settings of a clip: the protocol's 25 frames, or evenly spaced ones. Raises TrapsError."""
     if uniform is None:
         return SHOWN[media]
     if media == "video":
@@ -52,10 +52,10 @@ def shown(media: Literal["images", "video"], uniform: int | None = None) -> Medi
 
 
 def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"]) -> int:
-    """Write the harness of a released folder's pairs to an empty folder; returns the number of items.
+    """Write the harness of a released folder's pairs to an empty folder; return the number of items.
 
-    media: what is shown of a clip, of `shown`: the JPEGs or the mp4 that the pipeline sends, the same bytes. Raises
-    TrapsError for a release that was altered or has no answers, and for a folder that holds other files.
+    media: of `media_settings`: the JPEGs or the mp4 that the pipeline sends, byte for byte. Raises TrapsError for an
+    altered release or one without answers, and for a folder that holds other files.
     """
     if target.exists() and any(target.iterdir()):
         raise TrapsError(f"{target}: holds other files; give an empty or a new folder")
@@ -78,7 +78,7 @@ def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"
     }
     write_text(package / ABOUT, json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     for source in _COPIED:
-        write_text(package / Path(source).name, copied((_CODE / source).read_text(encoding="utf-8")))
+        write_text(package / Path(source).name, rewritten_source((_CODE / source).read_text(encoding="utf-8")))
     write_text(package / "__init__.py", f'"""The items, panel and metric of {manifest["name"]}."""\n')
     write_text(target / "traps_task.py", _TASK)
     write_text(target / "pyproject.toml", _PYPROJECT.format(version=manifest["version"].partition("+")[0]))
@@ -86,13 +86,13 @@ def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"
     return len(items)
 
 
-def copied(source: str) -> str:
-    """Return the source of a module of this package as one of the harness's: its imports name its neighbours there."""
+def rewritten_source(source: str) -> str:
+    """Return the source of one of this package's modules, with imports rewritten for the harness."""
     return _IMPORT.sub(lambda m: f"{m[1]}from {PACKAGE}.{m[2].rpartition('.')[2]} import ", source)
 
 
 def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
-    """Write items and what is shown of their clips; returns the digests of the items."""
+    """Write items and their media; return the digests of the items."""
     store, prepared, lines, hashes = MediaStore(package / ".prepared"), dict[str, list[str]](), list[str](), list[str]()
     for _, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row: dict[str, Any] = json.loads(line)
@@ -158,9 +158,11 @@ traps_harness = ["*.json", "*.jsonl", "media/**"]
 def _lmms(target: Path, about: Mapping[str, Any]) -> None:
     """Write a task for each regime.
 
-    lmms-eval takes the path of its items as it stands in the YAML, so the folder is not moved.
+    lmms-eval uses the items' path verbatim from the YAML, so the folder must not be moved.
     """
-    write_text(target / LMMS / "utils.py", copied((_CODE / "release/harness/lmms_utils.py").read_text("utf-8")))
+    write_text(
+        target / LMMS / "utils.py", rewritten_source((_CODE / "release/harness/lmms_utils.py").read_text("utf-8"))
+    )
     parameters = {"max_new_tokens": about["parameters"]["max_tokens"], "do_sample": True}
     parameters |= {name: about["parameters"][name] for name in ("temperature", "top_p")}
     for regime in PAPER_REGIMES:

@@ -1,1 +1,1 @@
-"""Pages on which people look at a study's answers: the explorer, a folder that opens from disk."""
+"""The explorer: pages to browse a study's answers, in a folder that opens from disk."""

@@ -1,8 +1,8 @@
-"""Answers, decisions and votes of a study in the order in which the explorer reads them.
+"""A study's answers, decisions and votes in the explorer's order.
 
 Every answer has a row: sorted by item, then by evaluation. Items are sorted so that those of a pair, and the pairs of a
 family, follow each other; a shard holds the texts and votes of consecutive pairs, so that a page of one pair needs one
-file, and rows need no key but their place.
+file, and a row's position is its key.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import pandas as pd
 
-pc: Any = pyarrow.compute  # it makes its functions when it is imported, where no type checker sees them
-NO, YES, NONE = 0, 1, 2  # values of a decision; none where an answer is not judged, or has no majority
+pc: Any = pyarrow.compute  # it creates its functions on import, invisible to type checkers
+NO, YES, NONE = 0, 1, 2  # values of a decision; NONE: not judged, or without a majority
 SHARD_ROWS = 1200  # answers: four pairs of the paper's 138 evaluations, which are read in a tenth of a second
 _EVALUATION = ("model", "regime", "run")
 _TEXTS = ("text", "reasoning", "finish_reason", "error", "served_model", "cost_usd")
@@ -49,9 +49,12 @@ class Shard:
 
 @dataclass(frozen=True)
 class StudyAnswers:
-    """A study's answers. items: ITEMS rows with `family`, in order. evaluations: in order. decisions: one row an answer
-    (item and evaluation by place, outcome (the answer's, or UNREAD) and epoch by place in `outcomes` and `epochs`,
-    abstained and correct as NO, YES or NONE, unanimous as 0 or 1)."""
+    """A study's answers.
+
+    items: ITEMS rows with `family`, in order. evaluations: in order. decisions: one row per answer: item and evaluation
+    by index, outcome (the answer's, or UNREAD) and epoch by index in `outcomes` and `epochs`, abstained and correct as
+    NO, YES or NONE, unanimous as 0 or 1.
+    """
 
     items: pd.DataFrame
     evaluations: Sequence[Evaluation]
@@ -62,7 +65,7 @@ class StudyAnswers:
     votes: pa.Table
 
     def shards(self) -> Iterator[Shard]:
-        """Yield the shards, in order; no pair is divided."""
+        """Yield the shards, in order, without splitting a pair."""
         item_of = self.decisions["item"].to_numpy()
         pairs = self.items["pair_id"].to_numpy()
         begins = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
@@ -80,7 +83,7 @@ class StudyAnswers:
 
 
 def study_items(workspace: Workspace) -> pd.DataFrame:
-    """Return ITEMS rows with `family`, datasets in the benchmark's order. Raises TrapsError where there are none."""
+    """Return ITEMS rows with `family`, datasets in the benchmark's order. Raises TrapsError if there are none."""
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
@@ -137,7 +140,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
 
 
 def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
-    """Return rows of a table whose item is in `items`, with the place of the item as the column `item`."""
+    """Return rows of a table whose item is in `items`, with the item's index as the column `item`."""
     rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
     place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
     rows = rows.drop_columns("item_id").append_column("item", place)
@@ -145,14 +148,14 @@ def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items:
 
 
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
-    """Return those that gave answers, by model, regime (in the benchmark's order) and run."""
+    """Return the evaluations with answers, by model, regime (in the benchmark's order) and run."""
     distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
     evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
     return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
-    """Return the rows with `key`, the place of item and evaluation; without those of evaluations without answers."""
+    """Return the rows with `key`, the index of item and evaluation; without evaluations that have no answers."""
     own = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
     known = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
     evaluation = pc.fill_null(pc.index_in(own, value_set=known), -1).to_numpy().astype(np.int64)
@@ -165,7 +168,7 @@ def _sorted(rows: pa.Table) -> pa.Table:
 
 
 def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
-    """Return the distinct values of a column, sorted, and each row's place among them."""
+    """Return the distinct values of a column, sorted, and each row's index among them."""
     values = sorted(column.unique().to_pylist())
     return values, pc.index_in(column, value_set=pa.array(values, pa.string())).to_numpy()
 

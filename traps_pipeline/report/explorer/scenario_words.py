@@ -1,4 +1,4 @@
-"""Words about a scenario, from its SCENE_SPECS row: its answer, what makes the void, what its certificates say."""
+"""Describe a scenario from its SCENE_SPECS row: its answer, the void's intervention, its certificates."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 
 def closes_frame(spec: Mapping[str, Any]) -> int | None:
-    """Return the frame from which an occluder closes the control; None if none does."""
+    """Return the frame at which an occluder closes the control; None if none does."""
     control = json.loads(spec["control"])
     return None if control is None else control["closes_frame"]
 
 
 def answer_of_control(spec: Mapping[str, Any]) -> str:
-    """Return the control's answer, and until when its outcome is in view."""
+    """Return the control's answer, and the time until which its outcome is visible."""
     frame, fps = closes_frame(spec), json.loads(spec["physics"])["fps"]
     return spec["ground_truth"] if frame is None else f"{spec['ground_truth']}, in view until {frame / fps:.1f} s"
 
@@ -42,7 +42,7 @@ _PHRASES = {
 
 
 def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield name and words of each number of a scenario's evidence, on which its certificates rest."""
+    """Yield name and description of each number in a scenario's evidence for its certificates."""
     for name, phrase in _PHRASES.items():
         if evidence.get(name) is not None:
             yield name, phrase.format(evidence[name])

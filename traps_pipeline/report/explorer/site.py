@@ -1,8 +1,8 @@
-"""The explorer: a folder that opens from disk or from any web host, on which people find and look at answers.
+"""Write the explorer: a folder to browse answers, from disk or any web host.
 
-`index.html` has one classic script; all data are script files, which a page that was opened from disk may load where it
-may not fetch; clips have relative paths. No request leaves the folder: the content policy forbids it. Figures come from
-the study's tables; the page counts decisions and computes no metric.
+`index.html` has one classic script; all data are script files, which a page opened from disk may load where it may not
+fetch; clips have relative paths. The content policy forbids any request outside the folder. Figures come from the
+study's tables; the page counts decisions and computes no metric.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ _ITEM_COLUMNS = (
     *("dataset", "scenario_id", "pair_id", "side", "category", "family", "sub_scenario", "question", "ground_truth"),
     *("control_answer", "answer_type", "clip"),
 )
-_PAGE_BYTES = 1 << 24  # a column of a shard is one page, since what repeats in it is then stored once
+_PAGE_BYTES = 1 << 24  # one page per column of a shard, so that repeated values are stored once
 _PUBLISHED = ("acc", "abs_rec", "false_abs", "pecs")
 
 
 @dataclass
-class Written:
-    """What a site holds: files and bytes by kind, and clips that the study lacks."""
+class SiteSummary:
+    """A summary of a site: files and bytes by kind, and missing clips."""
 
     answers: int = 0
     votes: int = 0
@@ -82,18 +82,18 @@ def site_files(workspace: Workspace) -> dict[str, bytes]:
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
 
-def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Written:
-    """Write the explorer and the report of a study to a folder that can be sent on, and return what it holds.
+def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> SiteSummary:
+    """Write a study's explorer and report to a self-contained folder, and return a summary.
 
-    Files of an earlier site in the folder are replaced, or removed where they are no longer needed; `index.html` is
-    written last. clips: whether clips are put there, as hard links where the file system allows it, else as copies.
-    Raises TrapsError where the folder holds something else, or the study has no items.
+    Files of an earlier site in the folder are replaced, or removed if they are no longer needed; `index.html` is
+    written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
+    the folder holds something else, or the study has no items.
     """
     former = _former_files(folder)
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
     existing = {name for name in names if workspace.resolve(name).is_file()}
-    summary = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
+    summary = SiteSummary(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - existing))
     page = workspace.reports / REPORT
     report = {REPORT: workspace.store.here(page).read_bytes()} if workspace.store.has(page) else {}
     files = report | _files(workspace, answers, scenarios, existing, "", report=bool(report))
@@ -115,7 +115,7 @@ def _files(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str], clips_at: str, *,
     report: bool,
 ) -> dict[str, bytes]:  # fmt: skip
-    """Return the files by path, the index last. clips: those that can be played, below the folder clips_at."""
+    """Return the files by path, the index last. clips: the playable ones, below the folder clips_at."""
     contents = _contents(workspace, answers, scenarios, clips)
     stamp = _digest(contents)
     files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
@@ -123,7 +123,7 @@ def _files(
 
 
 def _former_files(folder: Path) -> set[str]:
-    """Return the files of an earlier site in the folder. Raises TrapsError where the folder holds something else."""
+    """Return the files of an earlier site in the folder. Raises TrapsError if the folder holds something else."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return set()
     try:
@@ -142,7 +142,7 @@ def _is_inside(name: str) -> bool:
 
 
 def _put_clip(source: Path, target: Path) -> int:
-    """Link or copy a clip; returns its bytes. A clip's name holds what it shows, so one that is there is right."""
+    """Link or copy a clip; return its bytes. A clip's name identifies its content, so an existing one is right."""
     size = source.stat().st_size
     if not (target.is_file() and target.stat().st_size == size):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -181,7 +181,7 @@ def _contents(
 
 
 def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_clips: bool) -> dict[str, Any]:
-    """Return what every page of the explorer needs, and the leaderboard."""
+    """Return the data that every page of the explorer needs, and the leaderboard."""
     from traps_pipeline.models.registry import load_models
 
     board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
@@ -219,7 +219,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
 
 
 def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return what the page of a pair says about its scenario, by scenario."""
+    """Return the data about scenarios on the pages of pairs, by scenario."""
     specs, videos = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
     clips = {(row["scenario_id"], row["side"]): row for row in records(videos)}
     rows = []
@@ -241,22 +241,22 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
     return rows
 
 
-BOARD_COMES_S = 0.6  # so long a board is seen on its way at most
+BOARD_COMES_S = 0.6  # maximum time for which an occluder is visible on its way
 
 
 def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None:
-    """Return the last moment before the board comes into the picture that closes a control; null where none does."""
+    """Return the last moment before the occluder that closes a control becomes visible; null without one."""
     return None if closes is None or clip is None else (closes - 0.5) / clip["fps"] - BOARD_COMES_S
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the clips that the pages show, without names that lead out of the folder."""
+    """Return the clips shown on the pages, except for names that lead out of the folder."""
     named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
     return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
 
 
 def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the version of a site: a digest of all its data and of its script."""
+    """Return the version of a site: a digest of all its data and its script."""
     digest = hashlib.sha256(script().encode())
     for name, content in contents.items():
         for key, value in content.items():
@@ -270,7 +270,7 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """Return the one script: bundled libraries, then our sources. Raises TrapsError for another bundle than ours."""
+    """Return the script: bundled libraries, then our sources. Raises TrapsError for an unknown bundle."""
     library = LIBRARY.read_bytes()
     wanted = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
     if hashlib.sha256(library).hexdigest() != wanted:
@@ -303,7 +303,8 @@ def parquet_text(table: pa.Table) -> str:
 def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
     """Return the script of one data file, which calls the page's `TRAPS_DATA`.
 
-    version: of the whole site, as a page must not mix files of two. content: JSON values; Parquet is `parquet_text`.
+    version: of the whole site, so that a page never mixes files of two. content: JSON values; Parquet is
+    `parquet_text`.
     """
     # "<" cannot close a script element, should a host inline the file; JSON knows the escape.
     body = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""Where models abstain: visual against textual voids, standard against guided, doubt against conversion."""
+"""Figures of abstention: visual against textual voids, standard against guided, doubt against conversion."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ PERCENT = (0, 25, 50, 75, 100)
 
 
 def visual_textual(results: Results) -> Figure:
-    """Return AbsRec on visual (x) against textual voids (y), one point per model, averaged over the taxonomies that it
-    was asked; a second panel has the means by family."""
+    """Return AbsRec on visual (x) against textual voids (y), one point per model, averaged over its taxonomies; a
+    second panel has the means by family.
+    """
     rates = results.rates
     if not len(rates):
         raise NotRun(results.why("rates"))
@@ -53,7 +54,7 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
-    """Return whether a row has a model's rates pooled over taxonomies, or those of the only one it was asked."""
+    """Return whether a row has a model's rates pooled over taxonomies, or of its only taxonomy."""
     models = rates.loc[rates["taxonomy"] == "pooled", "model"]
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
 
@@ -131,8 +132,9 @@ def _abs_rec(sides: dict[tuple[str, str], Any], model: str, regime: str) -> floa
 
 def doubt(results: Results) -> Figure:
     """Return doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot for each dataset,
-    and a large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title says
-    why."""
+    and a large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title gives
+    the reason.
+    """
     points, refused = doubt_points(results)
     if not len(points):
         raise NotRun(refused or _no_doubt(results))
@@ -163,7 +165,7 @@ def _no_doubt(results: Results) -> str:
 
 
 def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
-    """Return thinking, other, dataset, doubt, gain (fractions) by pair and dataset; and why pairs were refused.
+    """Return thinking, other, dataset, doubt, gain (fractions) by pair and dataset; and reasons for refused pairs.
 
     AbsRec is that of `results.rates` (standard), whose epoch must be that of the labels (docs/spec.md 9.2).
     """

@@ -1,4 +1,4 @@
-"""What settles mechanistic claims: probes and baselines, the gate in the PECS plane, patching, doses among nulls."""
+"""Figures that test mechanistic claims: baselines of probes, gates in the PECS plane, patching, doses among nulls."""
 
 from __future__ import annotations
 
@@ -40,10 +40,11 @@ GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 
 
 def probe_baselines(results: Results) -> Figure:
-    """Return AUROC of each dataset's probe on itself and on the other datasets (black, with its interval) beside probes
-    on raw inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations. oc and
-    ch are occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch; † is
-    from fewer than ten items a side. A probe shows what the states add only as far as it is above all coloured marks.
+    """Return AUROC of each dataset's probe on itself and on the other datasets (black, with its interval), compared
+    with probes on raw inputs and on the output margin; grey is the floor of noise under the same split, mean ± 2
+    deviations. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and
+    scored on ch; † is from fewer than ten items a side. A probe shows information of the states only as far as it
+    exceeds all coloured marks.
     """
     rows = beside(results)
     if not len(rows):
@@ -90,8 +91,9 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
 def gate_arrows(results: Results) -> Figure:
     """Return each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates
     on states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
-    AbsRec less FalseAbs: an arrow to the right tells voids from controls better, an arrow downwards pays for it with
-    right answers."""
+    AbsRec minus FalseAbs: an arrow to the right means better separation of voids from controls, an arrow downwards a
+    loss of right answers.
+    """
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     rows = rows.loc[rows["features"].isin(_FEATURES)]
@@ -145,11 +147,12 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
 
 
 def patching(results: Results) -> Figure:
-    """Return indirect effect of each group of positions at each layer, for patches from the void into the control and
-    back; 1 is the whole difference of the outcome. Framed cells were patched; the others are estimates to first order,
-    from one backward pass a pair. The residual stream is all that a block hands on; attention and MLP, where they were
-    patched, are what one block adds to it. stamps are the time stamps, changed and unchanged the visual tokens whose
-    pixels differ between the sides and those whose pixels do not; last is the last token."""
+    """Return the indirect effect of each group of positions at each layer, for patches from the void into the control
+    and back; 1 is the whole difference of the outcome. Framed cells were patched; the others are first-order estimates,
+    from one backward pass per pair. The residual stream is the whole output of a block; attention and MLP, where they
+    were patched, are one block's additions to it. stamps are the time stamps, changed and unchanged the visual tokens
+    whose pixels differ or agree between the sides; last is the last token.
+    """
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
     if not len(rows):
@@ -157,7 +160,7 @@ def patching(results: Results) -> Figure:
         raise NotRun(absent)
     sites = [site for site in SITES if site in set(rows["site"])]
     cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
-    alone = len(sites) == 1  # then cases stand side by side; else a line has the sites of one case
+    alone = len(sites) == 1  # then cases are columns; otherwise a row has the sites of one case
     across = min(2, len(cases)) if alone else len(sites)
     panels = [(case, site) for case in cases for site in sites]
     lines = -(-len(panels) // across)
@@ -211,13 +214,14 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
 
 
 def doses_among_nulls(results: Results) -> Figure:
-    """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
-    gap, on pairs that the direction does not come from; doses that are longer than the cap, in states, are not given.
-    Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
-    and subtracted on voids (−); a larger dot stands for more draws. The direction does something of its own where its
-    line ends away from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions. n:
-    answers of a side, † fewer than ten. p: share of the draws of each null, in the order of the legend, that do as
-    much, the direction itself counted with them; on controls, then on voids."""
+    """Return abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the
+    class gap, on pairs that the direction does not come from; doses beyond the cap, in states, are left out. Right of
+    the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+) and
+    subtracted on voids (−); a larger dot means more draws. The direction has a specific effect where its line ends away
+    from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions. n: answers of a side, †
+    fewer than ten. p: share of the draws of each null, in the order of the legend, with at least the direction's
+    effect, counting the direction itself; on controls, then on voids.
+    """
     rows = results.own_effects
     if not len(rows):
         raise NotRun(why(results, "the paper has no such nulls"))
@@ -246,7 +250,7 @@ def doses_among_nulls(results: Results) -> Figure:
 
 
 def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
-    """Return the p of a direction among each of its nulls at the largest dose, a line a side."""
+    """Return the p of a direction among each of its nulls at the largest dose, one line per side."""
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
     lines: list[str] = []
@@ -258,7 +262,7 @@ def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dat
 
 
 def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
-    # Doses in alpha have a figure of their own; a gap may be so small that they would set the scale of this one.
+    # Doses in alpha have their own figure; with a small gap they would dominate the scale of this one.
     rows = rows.loc[rows["unit"] == "gap"]
     for side, line, marker, ink in (("control", "-", "o", INK), ("void", "--", "s", SOFT)):
         of = rows.loc[rows["side"] == side]

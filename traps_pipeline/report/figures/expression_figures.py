@@ -1,4 +1,4 @@
-"""What a model encodes and what it expresses: states against output item by item, and the margin by layer."""
+"""Figures of encoding and expression: states against output item by item, and the margin by layer."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ _LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
 
 
 def states_and_output(results: Results) -> Figure:
-    """Return every item by what states and output say of it, both read under the standard VQA prompt. Up: the score of
-    a probe that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the answer begins
-    with an abstention. A filled marker was answered under standard, a hollow one abstained on. Orange filled markers
-    above the line and left of it are encoded and not expressed. Above each panel: how well each orders voids before
-    controls (AUROC), sentences being whole abstentions against the model's own answer, and what noise gives under the
-    same split (mean and two deviations). A gap is one of orders too only where states are above the output by more than
-    that."""
+    """Return every item by its scores from states and from output, both read under the standard VQA prompt. Up: the
+    score of a probe that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the
+    answer begins with an abstention. A filled marker was answered under standard, a hollow one abstained on. Orange
+    filled markers above the line and left of it are encoded and not expressed. Above each panel: how well each score
+    separates voids from controls (AUROC), sentences being whole abstentions against the model's own answer, and the
+    floor of noise under the same split (mean and two deviations). There is a gap in AUROC, too, only if states exceed
+    the output by more than that.
+    """
     rows = scored_items(results)
     if not len(rows):
         raise NotRun(why(results, "the paper prints no scores of items"))
@@ -58,7 +59,9 @@ def states_and_output(results: Results) -> Figure:
 
 
 def scored_items(results: Results) -> pd.DataFrame:
-    """Return the items with both scores, and `sentence`: how much likelier an abstention is (nats a token, or NaN)."""
+    """Return the items with both scores, and `sentence`: by how much an abstention is likelier (nats per token, or
+    NaN).
+    """
     rows, read = results.item_scores, results.sentences
     read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
     read = read.assign(sentence=read["abstention"].astype(float) - read["own"].astype(float))
@@ -67,7 +70,7 @@ def scored_items(results: Results) -> pd.DataFrame:
 
 
 def orders(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the AUROC of states, of the output margin, and of whole sentences where they were read, on some items."""
+    """Return the AUROC of states, of the output margin, and of whole sentences if available, on some items."""
     void, areas = (rows["side"] == "void").to_numpy(), dict[str, float]()
     for name, column in (("states", "own"), ("margin", "margin"), ("sentences", "sentence")):
         values = rows[column].to_numpy(float)
@@ -94,9 +97,10 @@ def _scatter(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def lens(results: Results) -> Figure:
-    """Return mean log-odds of abstaining that the state of each layer gives through the model's own final norm and head
-    (logit lens), of voids (orange) and controls (blue), under both VQA prompts. Where the lines of a side part, the
-    prompt decides; at the last layer they are the output. The dotted line is even odds."""
+    """Return mean log-odds of abstaining from the state of each layer through the model's own final norm and head
+    (logit lens), of voids (orange) and controls (blue), under both VQA prompts. Where the lines of a side separate, the
+    prompt decides; at the last layer they are the output. The dotted line is even odds.
+    """
     rows = results.lens
     if not len(rows):
         raise NotRun(why(results, "the paper has no such curves"))

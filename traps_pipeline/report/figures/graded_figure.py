@@ -1,4 +1,4 @@
-"""Abstention and stated probability on graded cuts, against how probable the likeliest answer is."""
+"""The figure of graded cuts: abstention and stated probability against the probability of the likeliest answer."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LINES = ("-", "--", ":", "-.")
-_FROM = 0.2  # the likeliest of six answers is hardly less probable
-_APART = 0.008  # of the axis of probabilities, between the points of two models: several abstain and state alike
+_FROM = 0.2  # about the lowest probability of the likeliest of six answers
+_APART = 0.008  # horizontal offset between models, since several abstain and state alike
 
 
 def graded(results: Results) -> Figure:
     """Return the share of abstentions under regimes that ask for a decision (left), and the mean probability given to
-    the likeliest answer under regimes that ask for probabilities (right), over cuts whose likeliest answer is about
-    as probable. Grey: an ideal observer, who answers from the probability at which an answer is worth its risk, and
-    states the true one. A step at another place is another threshold; a slope is another knowledge. Models are drawn
-    side by side."""
+    the likeliest answer under regimes that ask for probabilities (right), over cuts with similar probability of the
+    likeliest answer. Grey: an ideal observer, which answers if the probability makes an answer worth its risk, and
+    states the true one. A shifted step means another threshold; another slope means other knowledge. Models are drawn
+    side by side.
+    """
     from matplotlib.lines import Line2D
 
     rows = results.graded
@@ -45,7 +46,7 @@ def graded(results: Results) -> Figure:
             legend.append(Line2D([], [], label=plain(str(model)), **look))
             for regime in regimes:
                 part = rows.loc[rows["model"].eq(model) & rows["regime"].eq(regime)]
-                if not len(part):  # the layout makes room for an unclipped line of nothing
+                if not len(part):  # the layout would reserve room for an unclipped empty line
                     continue
                 axes, share = (right, part["stated"]) if regime in states else (left, 1 - part["coverage"])
                 axes.plot(part["top"] + _APART * (k - len(models) / 2), share, linestyle=lines[regime], **look)

@@ -1,4 +1,4 @@
-"""Heatmaps over sub-scenarios, bars over the axes of confabulation, points of cues."""
+"""Grid figures: heatmaps over sub-scenarios, bars over the axes of confabulation, points of cues."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 AXES = {"hp": "HP", "ii": "II", "hp_and_ii": "HP and II", "es": "ES", "doubt": "Doubt"}
 GOOD, BAD = "the more the better", "the less the better"  # two colour scales
 HATCHES = ("", "/////", "xxxx", ".....", "-----")
-MOST_MODELS = 12  # columns of a heatmap that stay legible on a page's width
+MOST_MODELS = 12  # maximum legible columns of a heatmap on a page's width
 
 
 def sub_scenarios(results: Results) -> Figure:
@@ -66,7 +66,7 @@ def sub_scenarios(results: Results) -> Figure:
 
 @dataclass(frozen=True)
 class Panel:
-    """A heatmap: values (sub-scenarios, columns) in percent, on the scale of what is good or of what is bad."""
+    """A heatmap: values (sub-scenarios, columns) in percent, with a colour scale for good or for bad."""
 
     title: str
     columns: list[str]
@@ -75,7 +75,7 @@ class Panel:
 
 
 def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
-    """Return the panels of standard and of guided, a column a model."""
+    """Return the panels of standard and of guided, one column per model."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
     models_here = [model for model in load_models() if model in set(cells["model"])]
@@ -121,7 +121,8 @@ def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImag
 
 def confabulation(results: Results) -> Figure:
     """Return how often each axis applies to a model's sampled void failures, with 95 % Wilson intervals if the table
-    has them."""
+    has them.
+    """
     rows = results.confabulation
     if not len(rows):
         why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
@@ -156,7 +157,7 @@ def confabulation(results: Results) -> Figure:
 
 
 def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """Return how well each cue alone predicts the side, from `benchmark.shortcuts`; a line is at chance."""
+    """Return the accuracy of predicting the side by each cue, from `benchmark.shortcuts`, with a line at chance."""
     datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
     cues = list(dict.fromkeys(table["cue"]))
     with figure_style():

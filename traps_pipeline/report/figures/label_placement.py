@@ -1,4 +1,4 @@
-"""Labels of points, placed so that they overlap nothing."""
+"""Place the labels of points without overlap."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LINES = 2  # z-order of the lines between a model's points, which labels avoid where they can
-SAME_POINT = 0.018  # distance, as a share of the axes, under which two models share a label: about a marker's radius
+SAME_POINT = 0.018  # maximum distance, as a share of the axes, at which models share a label: about a marker's radius
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Label:
 
 
 def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
-    """Return the labels; those of coinciding points are joined, one name a line, in neutral colour."""
+    """Return the labels, with those of coinciding points joined, one name per line, in a neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     merged: list[Label] = []
     for label in labels:
@@ -39,9 +39,10 @@ def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
-    """Put every label near its point where it overlaps no marker, no label and, if possible nearby, no line.
+    """Put every label near its point without overlapping markers, labels and, if possible nearby, lines.
 
-    A leader line ties it to its point if they are apart, or several names stand at one. markers: (n, 2), data units.
+    A leader line connects a label to its point if they are apart, or if several names share a point. markers: (n, 2),
+    data units.
     """
     from matplotlib.patheffects import withStroke
 
@@ -117,6 +118,6 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def short(model: str) -> str:
-    """Return a label's text: no line break, no more than 28 characters."""
+    """Return a label's text without line breaks, shortened to 28 characters."""
     text = "".join(c if c.isprintable() else "?" for c in model)
     return text if len(text) <= 28 else text[:27] + "…"

@@ -83,7 +83,7 @@ def reasoning(results: Results) -> Figure:
 
 
 def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
-    """Draw the markers of every model; returns one label per model, at its guided point or else at its first one."""
+    """Draw the markers of every model; return one label per model, at its guided point or else at its first one."""
     labels, look = [], looks(points["model"])
     for model, rows in points.groupby("model", sort=True):
         colour, marker = look[str(model)]
@@ -111,7 +111,7 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
 
 
 def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
-    """Draw the 95 % intervals of J and Acc where the row has them, cut to the values that they can have."""
+    """Draw the 95 % intervals of J and Acc if the row has them, clipped to possible values."""
     style: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.55, "zorder": 1.8, "clip_on": False}
     for name, least in (("j", -1.0), ("acc", 0.0)):
         low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
@@ -171,7 +171,7 @@ def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> l
             arrow(axes, at[start], at[end], look[end][0])
         for k, model in enumerate(present):
             colour, marker = look[model]
-            face = colour if k == len(present) - 1 else "white"  # filled: thinks most
+            face = colour if k == len(present) - 1 else "white"  # filled: the member that thinks most
             axes.scatter(*at[model], s=20, marker=marker, facecolors=face, edgecolors=colour, linewidths=0.9, zorder=4)
             labels.append(Label(*at[model], short(model), colour))
     return labels

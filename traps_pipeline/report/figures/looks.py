@@ -1,4 +1,4 @@
-"""The colour (of its family) and marker of each model in all figures, and shared parts of figures in (Acc, J)."""
+"""The colour (by family) and marker of each model in all figures, and shared parts of figures in (Acc, J)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: boo
 
 
 def _values(points: pd.DataFrame, name: str, least: float, *, intervals: bool) -> np.ndarray:
-    """Return the values of a column, and the ends of their intervals, cut to what they can be."""
+    """Return the values of a column, and the ends of their intervals, clipped to possible values."""
     names = [name, *(end for end in (f"{name}_ci_low", f"{name}_ci_high") if intervals and end in points)]
     values = points[names].to_numpy(float).ravel()
     return np.clip(values[np.isfinite(values)], least, 1.0)

@@ -1,4 +1,4 @@
-"""Probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
+"""Figures of probes and steering: probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-# A source has a colour and a line style, a target a marker, so that they differ without colour as well.
+# A source has a colour and a line style, a target a marker, so that they also differ without colour.
 COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
 LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
 MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
-FAMILY_COLOUR = {"occlusion": "#0072B2", "chaotic": "#C8102E"}  # of directions, in dose and response
+FAMILY_COLOUR = {"occlusion": "#0072B2", "chaotic": "#C8102E"}  # colours of directions in dose and response
 # The paper draws four key paths and does not name them. These cross the domains onto visual voids.
 KEY_PATHS = [(s, t) for s, t in TRANSFER if taxonomy_of(s) != taxonomy_of(t) and not is_ill_posed(t)]
-COSINE_SCALE = 0.6  # of the paper's heatmaps
+COSINE_SCALE = 0.6  # scale of the paper's heatmaps
 CROSSING = TRANSFER_TYPES[:3]
 SETS = {"transfer": "transfer", "within_domain": "within"}
 
@@ -143,11 +143,12 @@ def _strip(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def dose_response(results: Results) -> Figure:
-    """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along directions
-    of the standard prompt under guided inference if they were run. Directions of the occlusion family are blue, those
-    of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are strong and
-    the others faint. n is the number of answers of a marker. Grey is the mean over the paths with its 95 % interval
-    from resampled scenarios."""
+    """Return abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along
+    directions of the standard prompt under guided inference if they were run. Directions of the occlusion family are
+    blue, those of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are
+    strong and the others faint. n is the number of answers of a marker. Grey is the mean over the paths with its 95 %
+    interval from resampled scenarios.
+    """
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
@@ -176,7 +177,7 @@ def dose_response(results: Results) -> Figure:
 
 
 def _answers(part: pd.DataFrame, side: str) -> str:
-    """Return how many answers a marker stands for."""
+    """Return the number of answers behind a marker."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
     return f", n {from_to(min(counts), max(counts))}" if len(counts) else ""
 
@@ -222,10 +223,11 @@ def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str
 
 def cosine_heatmaps(results: Results) -> Figure:
     """Return cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one
-    scale of ±0.6. Below the diagonal: of the directions themselves. Above it: without the noise of few pairs and of
-    shared controls, with a star where the 95 % interval excludes 0. On the diagonal: of the directions of two halves of
-    the pairs; where it is low, a small cosine says nothing. A dash is a pair without a figure; the paper has one figure
-    a pair."""
+    scale of ±0.6. Below the diagonal: of the directions themselves. Above it: corrected for the noise of few pairs and
+    of shared controls, with a star if the 95 % interval excludes 0. On the diagonal: of the directions of two halves of
+    the pairs; if it is low, a small cosine is uninformative. A dash is a pair without a figure; the paper has one
+    figure per pair.
+    """
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):

@@ -31,11 +31,11 @@ from traps_pipeline.report.tables.table_columns import (
     no_overall,
     ordered,
     rightly_empty,
-    titled,
     together,
+    with_titles,
 )
 from traps_pipeline.report.terms import SIDE_OF
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 
@@ -78,12 +78,12 @@ def visual_textual(results: Results) -> list[PrintedTable]:
     ]
 
 
-def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
+def _rate_trace(row: Mapping[str, Any], field: str) -> SourceItems:
     if field in COUNTED:
-        return Behind("", row["model"], "standard")
+        return SourceItems("", row["model"], "standard")
     taxonomy, _, kind = field.rpartition("_")
     dataset = {"visual": taxonomy, "textual": f"{taxonomy}_ill_posed"}.get(kind, "") if taxonomy != "pooled" else ""
-    return Behind(dataset, row["model"], "standard", "void")
+    return SourceItems(dataset, row["model"], "standard", "void")
 
 
 def uplift(results: Results) -> list[PrintedTable]:
@@ -121,9 +121,9 @@ def uplift(results: Results) -> list[PrintedTable]:
     return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
 
 
-def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
+def _regime_trace(row: Mapping[str, Any], field: str) -> SourceItems:
     regime, _, figure = field.partition("_")
-    return Behind("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
+    return SourceItems("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
 
 
 def naive(results: Results) -> list[PrintedTable]:
@@ -131,7 +131,7 @@ def naive(results: Results) -> list[PrintedTable]:
     cells = results.cells.loc[results.cells["regime"] == GUIDED]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
-    rows = titled(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
+    rows = with_titles(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
     columns = [
         MODEL, DATASET, SHARES[0], SHARES[1], SHARES[2], PECS,
         Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
@@ -150,8 +150,8 @@ def naive(results: Results) -> list[PrintedTable]:
 
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
-    """Return cells with PECS 0: void is not told from control, or no control is answered correctly."""
-    rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
+    """Return cells with PECS 0: voids are not told from controls, or no control is answered correctly."""
+    rows = ordered(with_titles(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
@@ -189,7 +189,7 @@ def reasoning(results: Results) -> list[PrintedTable]:
     refused += sorted({reason for reason in reasons if reason})
     table = table.loc[[reason is None for reason in reasons]].reset_index(drop=True)
     table = counted(table, cells, [(member, "regime", "dataset") for member in ("thinking", "other")])
-    table = ordered(titled(table), ["thinking", "regime", "dataset"])
+    table = ordered(with_titles(table), ["thinking", "regime", "dataset"])
     columns = [
         Column("thinking", "Thinking"), Column("other", "Other"), REGIME, DATASET,
         *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
@@ -197,7 +197,7 @@ def reasoning(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
     notes += [*marks(table), *refused]
-    trace: Trace = lambda row, field: Behind(  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
     why = "no reasoning pair has both members evaluated on one dataset"
@@ -226,21 +226,21 @@ def contrasts(results: Results) -> list[PrintedTable]:
     if TOO_FEW in set(rows["separable"]):
         notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
     notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
-    trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
     return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
 
 
 def regime_tests(results: Results) -> list[PrintedTable]:
     """Return McNemar's test of two regimes on the same items, by dataset, model and run."""
-    rows = ordered(titled(results.regime_tests), ["dataset", "model", "run", "decision"])
+    rows = ordered(with_titles(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
         DATASET, MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
         Column("left_regime", "Left"), Column("right_regime", "Right"), Column("n", "n", "count"),
         Column("only_left", "Yes, left alone", "count"), Column("only_right", "Yes, right alone", "count"),
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("refused", "Refused"),
     ]  # fmt: skip
-    trace: Trace = lambda row, field: Behind(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
     why = "no model has two regimes" if results.is_study else results.why("regime_tests")
     return [PrintedTable("regime_tests", "McNemar’s test of regimes", rows, columns, why=why, trace=trace)]
 
@@ -263,7 +263,7 @@ def spreads(results: Results) -> list[PrintedTable]:
     notes = ["quartiles over cells of the population standard deviation of PECS over runs; cells of one run left out"]
     why = "no cell has more than one run" if len(cells) else results.why("cells")
     rows = frame(rows, ["family"])
-    trace: Trace = lambda row, field: Behind()  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems()  # noqa: E731
     return [PrintedTable("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], why, trace)]
 
 
@@ -287,7 +287,7 @@ def degenerate(results: Results) -> list[PrintedTable]:
         notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
         notes += marks(rows)
     trace: Trace = lambda row, field: (  # noqa: E731
-        Behind("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
+        SourceItems("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
     )
     return [
         PrintedTable(

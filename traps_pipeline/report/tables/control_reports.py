@@ -1,4 +1,4 @@
-"""Controls beside the mechanistic claims: baselines of probes, nulls of directions, PECS under gates."""
+"""Tables of controls for the mechanistic claims: baselines of probes, nulls of directions, PECS under gates."""
 
 from __future__ import annotations
 
@@ -53,9 +53,11 @@ def probe_baselines(results: Results) -> list[PrintedTable]:
 
 
 def beside(results: Results) -> pd.DataFrame:
-    """Return one row per model and ordered pair of datasets, a dataset on itself among them: the probe at the target's
-    chosen layer, with its interval, and each baseline. Within a taxonomy all of them are fitted without the scored
-    scenario (`held_out`), elsewhere on all of the source (`transfer`)."""
+    """Return one row per model and ordered pair of datasets, with the probe's figure and each baseline.
+
+    Pairs include a dataset on itself. The figure is at the target's chosen layer, with its interval. Within a taxonomy
+    all are fitted without the scored scenario (`held_out`), otherwise on all of the source (`transfer`).
+    """
     import pandas as pd
 
     wanted = pd.DataFrame(
@@ -67,7 +69,7 @@ def beside(results: Results) -> pd.DataFrame:
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
-    """Return what `beside` does for items that only look like voids, by probes of the datasets of their taxonomy."""
+    """Return `beside` for items that only resemble voids, by probes of the datasets of their taxonomy."""
     probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
@@ -171,7 +173,7 @@ def _nulls(results: Results) -> PrintedTable:
 
 
 def _ahead(rows: pd.DataFrame) -> list[str]:
-    """Return where the void direction is ahead of all but a twentieth of its nulls, in words."""
+    """Return where the void direction exceeds at least 95 % of its nulls, in words."""
     own = rows.loc[rows["target"] != "all"]
     if own.empty:
         return []
@@ -188,7 +190,7 @@ def _pecs(results: Results) -> PrintedTable:
 
     rows = results.steering_pecs
     rows = rows.loc[rows["source"] == rows["target"]]
-    unsteered = rows["dose"] == 0  # once for each path: it is the same model in every unit and under all signs
+    unsteered = rows["dose"] == 0  # once per path: the unsteered model is the same in every unit and under all signs
     named = pd.concat([rows.loc[unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~unsteered]])
     rows = named.sort_values([*MODEL_OF, "source"], kind="stable", ignore_index=True)
     named = rows.assign(
@@ -221,7 +223,9 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 
 def gate(results: Results) -> list[PrintedTable]:
-    """Return PECS before and after probe gates, by source, threshold and features; what they and the prompt change."""
+    """Return PECS before and after probe gates, by source, threshold and features; and the change by them and by the
+    prompt.
+    """
     return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
 
 
@@ -305,10 +309,12 @@ def _gate_answerable(results: Results) -> PrintedTable:
 
 
 def prompts(results: Results) -> pd.DataFrame:
-    """Return one row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
-    prompts the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario) and of the output
-    margin; those of the best raw input and of noise; n_answered, the fewest voids that were answered under either
-    prompt, n_voids and n_controls of the probe."""
+    """Return one row per model and dataset, with AbsRec under standard and guided (shares) and their difference.
+
+    Also, for both prompts, the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario)
+    and of the output margin; those of the best raw input and of noise; n_answered, the fewest voids answered under
+    either prompt, n_voids and n_controls of the probe.
+    """
     import pandas as pd
 
     keys = ["model", "dataset"]

@@ -1,4 +1,4 @@
-"""What models earn on graded cuts, beside an ideal observer and strategies that know nothing of a clip."""
+"""Models' earnings on graded cuts, beside an ideal observer and strategies that know nothing of a clip."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ WHY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
-    """Return what each model is expected to earn on cuts whose answers have known probabilities, and what it loses by
-    not knowing them, by answering too often and by abstaining too often."""
+    """Return the expected points of each model on cuts whose answers have known probabilities, and its losses by
+    ignorance, by rash answers and by needless abstention.
+    """
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]
     two_digits = partial(fraction, digits=2)

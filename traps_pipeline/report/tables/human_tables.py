@@ -1,4 +1,4 @@
-"""What people score, how far they agree, and scores corrected for the panel's errors (docs/people.md)."""
+"""Tables of people's scores and agreement, and of scores corrected for the panel's errors (docs/people.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from traps_pipeline.report.tables.table_columns import (
     RUNS,
     figure_with_interval,
     ordered,
-    titled,
+    with_titles,
 )
 from traps_pipeline.report.writing import NOT_RUN, Column, PrintedTable, fraction, percent
 
@@ -27,8 +27,8 @@ _PERCENT = (*SHARES, "sensitivity", "specificity")
 
 
 def people(results: Results) -> list[PrintedTable]:
-    """Return what people score on the clips, by dataset, and how far people agree about clips and answers."""
-    rows = ordered(titled(results.human_row), ["dataset"])
+    """Return people's scores on the clips, by dataset, and their agreement about clips and answers."""
+    rows = ordered(with_titles(results.human_row), ["dataset"])
     rows = _with_intervals(rows, [*_FIGURES])
     figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
     columns = [
@@ -69,7 +69,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
     shown = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
-    shown = ordered(titled(shown), ["dataset", "model", "regime"])
+    shown = ordered(with_titles(shown), ["dataset", "model", "regime"])
     figures = [
         Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
         for field, heading in _FIGURES.items()
@@ -102,7 +102,7 @@ def _shown(row: Mapping[Any, Any], field: str) -> str:
 
 
 def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
-    """Return notes beside a leaderboard: what people score, and whether the panel was validated."""
+    """Return notes beside a leaderboard: people's scores, and whether the panel was validated."""
     return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
 
 

@@ -1,4 +1,4 @@
-"""What the paper supposes and did not measure, dose by dose (docs/hypotheses.md)."""
+"""Tables of the paper's untested assumptions, dose by dose (docs/hypotheses.md)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 
 def hypotheses(results: Results) -> list[PrintedTable]:
-    """Return how answers and abstentions change when one thing is changed step by step, beside what rules get."""
+    """Return how answers and abstentions change as one property changes step by step, beside shortcut rules."""
     from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]

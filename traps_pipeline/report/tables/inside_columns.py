@@ -1,5 +1,7 @@
-"""Columns, marks and notes that tables of what is found inside models share, and what stands beside a probe's figures:
-the best of the raw inputs, the output margin and the floor of noise."""
+"""Shared columns, marks and notes of tables about mechanistic analyses, and the baselines beside a probe's figures.
+
+The baselines are the best of the raw inputs, the output margin and the floor of noise.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ LAYER, ALPHA = Column("layer", "Layer", "count"), Column("alpha", "α", "count")
 SIDES = (Column("n_voids", "Voids", "count"), Column("n_controls", "Controls", "count"))
 DRAWS = "± standard deviation over draws of noise"
 NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's states were read"
-FEW = 10  # items of a side, or answers of a cell, below which a value is marked
+FEW = 10  # values from fewer items of a side, or answers of a cell, are marked
 FEW_MARK = "†"
 SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stamps")
 KEYS = ["model", "source", "target"]
@@ -37,14 +39,14 @@ BASELINE_NOTES = (
 
 
 def why(results: Results, of_paper: str = "") -> str:
-    """Return why a frame of what is found inside models has no rows. of_paper: the reason for the paper's."""
+    """Return why a frame of mechanistic analyses has no rows. of_paper: the reason for the paper's."""
     if of_paper and not results.is_study:
         return of_paper
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """Return the mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
+    """Return the mark of each row: a dagger if one of the counts is below FEW; empty for unknown counts."""
     import pandas as pd
 
     numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
@@ -52,7 +54,7 @@ def few(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
-    """Return the meaning of the mark, if a row has it in one of these columns. of: what is counted."""
+    """Return the meaning of the mark, if a row has it in one of these columns. of: the counted things."""
     used = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if used else []
 
@@ -66,7 +68,7 @@ def interval(prefix: str = "", unit: str = "fraction", digits: int | None = None
 
 
 def short_names(names: Iterable[str]) -> list[str]:
-    """Return the datasets' short names; of anything else its own name, where it is stated."""
+    """Return the datasets' short names; any other name unchanged."""
     return [SHORT.get(name, name) if isinstance(name, str) and name else "not stated" for name in names]
 
 
@@ -76,7 +78,7 @@ def path_names(rows: pd.DataFrame) -> list[str]:
 
 
 def by_features(results: Results) -> pd.DataFrame:
-    """Return a row per AT of `probe_baselines`: the value of each of its features, and noise_spread."""
+    """Return one row per AT of `probe_baselines`: the value of each of its features, and noise_spread."""
     import pandas as pd
 
     rows = results.baselines
@@ -117,5 +119,5 @@ def baseline_columns(results: Results, prefix: str = "", head: str = "") -> list
 
 
 def baseline_notes(results: Results) -> list[str]:
-    """Return what the columns of BESIDE are; nothing of the paper, which has none."""
+    """Return notes that explain the columns of BESIDE; empty for the paper, which has none."""
     return [*BASELINE_NOTES] if results.is_study else []

@@ -1,4 +1,4 @@
-"""Agreement of the judges, their bias, confabulation and its validation (docs/spec.md 4.4 and 6)."""
+"""Tables of the judges' agreement and bias, of confabulation, and of its validation (docs/spec.md 4.4 and 6)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from traps_pipeline.report.tables.table_columns import (
     cell_trace,
     epochs,
     ordered,
-    titled,
+    with_titles,
 )
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,7 +29,7 @@ def agreement(results: Results) -> list[PrintedTable]:
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
-    rows = ordered(titled(rows), ["dataset", "task"])
+    rows = ordered(with_titles(rows), ["dataset", "task"])
     columns = [
         DATASET, Column("task", "Task"), Column("agreement", "Unanimous %", "percent"),
         Column("fleiss_kappa", "Fleiss’ κ", "fraction"), Column("alpha", "Krippendorff’s α", "fraction"),
@@ -42,8 +42,8 @@ def agreement(results: Results) -> list[PrintedTable]:
     return [PrintedTable("judge_agreement", "Agreement of the judges", rows, columns, notes, why, _task_trace)]
 
 
-def _task_trace(row: Mapping[str, Any], field: str) -> Behind:
-    return Behind(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
+def _task_trace(row: Mapping[str, Any], field: str) -> SourceItems:
+    return SourceItems(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
 
 
 def _undefined(rows: pd.DataFrame) -> list[str]:
@@ -53,7 +53,7 @@ def _undefined(rows: pd.DataFrame) -> list[str]:
 
 def judge_bias(results: Results) -> list[PrintedTable]:
     """Return the bias of every judge against the panel, and PECS without that judge."""
-    bias = ordered(titled(results.bias), ["dataset", "task", "judge"])
+    bias = ordered(with_titles(results.bias), ["dataset", "task", "judge"])
     columns = [
         DATASET, Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),
         Column("panel_yes", "Panel’s yes %", "percent"), Column("bias", "Bias, points", "percent"),
@@ -62,7 +62,7 @@ def judge_bias(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     left = results.leave_one_out
     left = left.loc[left["dataset"] == "overall"] if "overall" in set(left["dataset"]) else left
-    left = ordered(titled(left), ["model", "regime", "without"])
+    left = ordered(with_titles(left), ["model", "regime", "without"])
     without = [
         MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),
@@ -96,7 +96,7 @@ def validation(results: Results) -> list[PrintedTable]:
             columns,
             notes,
             why,
-            lambda row, field: Behind("", "", "standard", "void"),
+            lambda row, field: SourceItems("", "", "standard", "void"),
             dash="undefined",
         )
     ]
@@ -114,5 +114,5 @@ def confabulation(results: Results) -> list[PrintedTable]:
     if results.is_study:
         columns += [Column("n_sampled", "Sampled", "count"), Column("evidence", "Evidence"), Column("judge", "Judge")]
     why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
-    trace: Trace = lambda row, field: Behind("", row["model"], "standard", "void")  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems("", row["model"], "standard", "void")  # noqa: E731
     return [PrintedTable("confabulation", "Confabulation: prevalence by model", rows, columns, notes, why, trace)]

@@ -25,10 +25,10 @@ from traps_pipeline.report.tables.table_columns import (
     no_overall,
     ordered,
     ranks,
-    titled,
+    with_titles,
 )
 from traps_pipeline.report.terms import TITLES
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.published import published_overall
 
@@ -87,7 +87,7 @@ def per_dataset(results: Results) -> list[PrintedTable]:
     columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
     rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
     notes = [epochs(cells), "mean: overall, over the runs that have all four datasets", *marks(cells)]
-    trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
+    trace: Trace = lambda row, field: SourceItems(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
     return [PrintedTable("per_dataset", "PECS by dataset", rows, columns, notes, results.why("cells"), trace)]
 
 
@@ -95,7 +95,7 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
     """Return the replication families' figures on each dataset."""
     cells = marked(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
-    rows = ordered(titled(rows), ["model", "dataset", "regime"])
+    rows = ordered(with_titles(rows), ["model", "dataset", "regime"])
     columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     why = "no model of the replication families"

@@ -1,4 +1,4 @@
-"""Probes as tables (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, centroids; beside baselines."""
+"""Tables of probes (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, centroids; beside baselines."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ APART = "not computed; held out: these datasets share no controls and no scenari
 
 
 class At(NamedTuple):
-    """Which row of PROBES a pair's figure is: of this analysis, at the layer that has this flag; and its columns."""
+    """A rule that selects a pair's row of PROBES (an analysis, at the layer with a flag), and its columns."""
 
     analysis: str
     flag: str
@@ -73,7 +73,7 @@ BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_hel
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return PAIR_FIGURES, a row per model and ordered pair: best and chosen layers, and Cf->Cf at both."""
+    """Return PAIR_FIGURES, one row per model and ordered pair: best and chosen layers, and Cf->Cf at both."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -282,7 +282,7 @@ def _catch(results: Results) -> PrintedTable:
 
 
 def _caught_columns() -> Iterator[Column]:
-    """Yield what each kind of baseline catches, and its share of controls."""
+    """Yield the columns of each kind of baseline: the assigned share of look-alikes and of controls."""
     yield Column("raw", "Best raw input")
     for name, heading in (("raw", "catches %"), ("margin", "Output margin %"), ("noise", "Noise %")):
         yield Column(f"{name}_void", heading, "percent")
@@ -297,8 +297,10 @@ def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _caught_beside(results: Results) -> pd.DataFrame:
-    """Return one row per model, target and sub-scenario: what the best raw input, the output margin and noise catch,
-    and the share of controls that they assign to void, means over sources."""
+    """Return one row per model, target and sub-scenario: shares that the baselines assign to void.
+
+    Baselines are the best raw input, the output margin and noise; shares, also of controls, are means over sources.
+    """
     import pandas as pd
 
     keys = ["model", "target", "sub_scenario"]
@@ -338,8 +340,11 @@ def _layers(results: Results) -> PrintedTable:
 
 
 def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Return one row per model and layer: for each dataset the mean AUROC of pairs of the others, marked where it is
-    chosen, and how many datasets have the maximum of their own cross-validation there; and a note on ties a model."""
+    """Return one row per model and layer, and a note per model on ties.
+
+    A row has, for each dataset, the mean AUROC of pairs of the others, marked at the chosen layer, and the number of
+    datasets whose own cross-validation is maximal there.
+    """
     import pandas as pd
 
     parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()

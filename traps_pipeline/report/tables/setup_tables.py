@@ -1,4 +1,4 @@
-"""The setup of a study: models, their parameters, and the benchmark's composition (docs/spec.md 2 and 3)."""
+"""Tables of a study's setup: models, their parameters, and the benchmark's composition (docs/spec.md 2 and 3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Directions and steering as tables (docs/spec.md 8); probes are in `probes`."""
+"""Tables of directions and steering (docs/spec.md 8)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def cosines(results: Results) -> list[PrintedTable]:
-    """Return cosines of void directions, of datasets under one prompt and of a dataset under both; and reliability."""
+    """Return cosines of void directions, of datasets under one prompt and of a dataset under both; and their
+    reliability.
+    """
     rows = results.cosines
     order = [*SHORT]
     place, other = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
@@ -198,7 +200,7 @@ def _in_gaps(results: Results) -> list[Column]:
 
 
 def _counts(results: Results) -> list[Column]:
-    """Return what stands behind a cell's two shares; the paper prints neither."""
+    """Return the numbers of answers behind a cell's two shares; the paper prints neither."""
     if not results.is_study:
         return []
     return [
@@ -208,7 +210,7 @@ def _counts(results: Results) -> list[Column]:
 
 
 def _cell_notes(results: Results) -> list[str]:
-    """Return how many answers a cell has at most, and what that says of all figures made of cells."""
+    """Return notes on the maximum answers of a cell, and its consequence for figures made of cells."""
     counts = results.effects["n"].dropna()
     if not len(counts):
         return []

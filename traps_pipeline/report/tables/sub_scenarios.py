@@ -1,4 +1,4 @@
-"""Sub-scenarios of both taxonomies (docs/spec.md 2.2 and 5.4)."""
+"""Tables of sub-scenarios of both taxonomies (docs/spec.md 2.2 and 5.4)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import DATASET, MISSING, PECS, SHARES, N, epochs, marked, marks, titled
+from traps_pipeline.report.tables.table_columns import (
+    DATASET,
+    MISSING,
+    PECS,
+    SHARES,
+    N,
+    epochs,
+    marked,
+    marks,
+    with_titles,
+)
 from traps_pipeline.report.terms import SIDE_OF
-from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
@@ -37,7 +47,7 @@ def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
     """Return means over models of every chaotic family, and Acc by the control's answer."""
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
-    labels = titled(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
+    labels = with_titles(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
     columns = [
         DATASET, Column("sub_scenario", "Sub-scenario"), Column("label", "Ground truth"),
         Column("acc", "Acc %", "percent"),
@@ -80,12 +90,12 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
 
 
 def _sub_trace(taxonomy: str) -> Trace:
-    def trace(row: Mapping[str, Any], field: str) -> Behind:
+    def trace(row: Mapping[str, Any], field: str) -> SourceItems:
         if field in ("n_pairs", "n_models", "n", "n_missing"):
-            return Behind(taxonomy)
+            return SourceItems(taxonomy)
         regime = "guided" if field.startswith("guided_") else "standard"
         ill_posed = field == "abs_rec_ill_posed"
         dataset = str(row.get("dataset") or taxonomy)
-        return Behind(f"{taxonomy}_ill_posed" if ill_posed else dataset, "", regime, SIDE_OF.get(field, ""))
+        return SourceItems(f"{taxonomy}_ill_posed" if ill_posed else dataset, "", regime, SIDE_OF.get(field, ""))
 
     return trace

@@ -14,7 +14,7 @@ from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
-from traps_pipeline.report.writing import NONE, Behind, Column, PrintedTable, fraction
+from traps_pipeline.report.writing import NONE, Column, PrintedTable, SourceItems, fraction
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,13 +38,13 @@ COUNTS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
-def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
+def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     """Return the items behind a number, by the row's model and regime, and by its dataset if it has one."""
     if field.startswith("published"):
         return None
     dataset = row.get("dataset")
     side = SIDE_OF.get(field, "")
-    return Behind(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
+    return SourceItems(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
 
 
 def marked(rows: pd.DataFrame) -> pd.DataFrame:
@@ -54,13 +54,13 @@ def marked(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
 
 
-def titled(rows: pd.DataFrame) -> pd.DataFrame:
+def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with `title`, the printed name of the dataset."""
     return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
 
 def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return COUNTED for a comparison of entries: the fewest pairs and runs of any entry, the missing items of all."""
+    """Return COUNTED for a comparison of entries: the minimum of pairs and runs, the sum of missing items."""
     if not sides:
         return dict.fromkeys(COUNTED)
     counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
@@ -97,7 +97,7 @@ def meanings(marks: Iterable[str]) -> list[str]:
 
 
 def epochs(rows: pd.DataFrame) -> str:
-    """Return the note on epochs: it names the single epoch, or says how epochs are mixed; empty without rows."""
+    """Return the note on epochs: the only epoch, or how epochs are mixed; empty without rows."""
     known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
     single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
     if len(single) <= 1:
@@ -114,13 +114,13 @@ def epochs(rows: pd.DataFrame) -> str:
 
 
 def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
-    """Return the columns to show: for a study all, for the paper's numbers those that the paper prints."""
+    """Return the columns to show: all for a study, for the paper those that it prints."""
     is_complete = results.is_study or not len(rows)
     return [c for c in columns if is_complete or c.field not in rows or not rows.loc[:, c.field].isna().all()]
 
 
 def best_first(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows by falling PECS, nulls last."""
+    """Return the rows by decreasing PECS, nulls last."""
     return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
 
 

@@ -1,8 +1,8 @@
-"""The patching stage: matched controls and voids of the well-posed datasets, pair by pair, as rows of PATCHING.
+"""The patching stage: patch matched controls and voids of the well-posed datasets, as rows of PATCHING.
 
-One backward pass a pair estimates the effect of every site, layer and group of positions; the cells with the largest
-estimates are then patched, beside nulls. What came of a pair is written before the next one begins, so that a stopped
-run goes on there. States of at most two passes are in memory at once.
+One backward pass per pair estimates the effect of every site, layer and group of positions; the cells with the largest
+estimates are then patched, beside nulls. Each pair's result is written before the next one begins, so that an
+interrupted run resumes there. States of at most two passes are in memory at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.patching_effects import (
     Patch,
-    Recorded,
+    RecordedPass,
     attributed_changes,
     patched_changes,
     record,
@@ -56,25 +56,25 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
-WELL_POSED = ("occlusion", "chaotic")  # their sides have the same question, and clips of as many shown frames
+WELL_POSED = ("occlusion", "chaotic")  # datasets whose sides have the same question and equally many shown frames
 OWN, OTHER, SAME, TIMES = SOURCES = ("pair", "other scenario", "same side", "other times")
 GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 RESAMPLES = 1000
-PROMPTS_KEPT = 8  # with their pixels; the parts of all prompts are kept
+PROMPTS_KEPT = 8  # prompts with their pixels in memory; the parts of all prompts are kept
 Row = dict[str, Any]
-Cell = tuple[str, Site, int, str]  # the side that is patched into, site, layer, group
+Cell = tuple[str, Site, int, str]  # patched side, site, layer, group
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side of a pair: its prompt, and the groups of its positions that do not depend on the other side."""
+    """One side of a pair: its prompt, and its groups of positions that do not depend on the other side."""
 
     prompt: Prompt
     parts: Mapping[str, np.ndarray]
 
 
 def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[PatchingRow]:
-    """Make the rows of PATCHING of a model under a VQA prompt. Raises TrapsError for a model that cannot be patched."""
+    """Return the rows of PATCHING of a model under a VQA prompt. Raises TrapsError if it cannot be patched."""
     from traps_pipeline.models.local.adapter import load_local_model
 
     settings = workspace.mechanism.patching
@@ -85,14 +85,14 @@ def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
     for dataset in WELL_POSED:
         if workspace.tables.state(PROBE_ITEMS, {"dataset": dataset}) is not None:
             changes = Pairs(workspace, entry, extraction, dataset, model, settings).changes()
-            rows += summed(*changes, extraction, dataset, workspace.mechanism.seed)
+            rows += summarize_effects(*changes, extraction, dataset, workspace.mechanism.seed)
     if not rows:
         raise TrapsError("patching: no pairs of a well-posed dataset; materialize probe_items first")
     return rows
 
 
 class Pairs:
-    """The pairs of a dataset that are patched, and the files that hold what came of each."""
+    """The patched pairs of a dataset, and the files with each pair's results."""
 
     def __init__(
         self,
@@ -118,18 +118,20 @@ class Pairs:
         self._folder = workspace.root / "patching" / extraction.model / extraction.prompt / dataset
 
     def changes(self) -> tuple[list[Row], list[Row]]:
-        """Return what every patch from the other side does by estimate, and what the patches of `best_cells` and their
-        nulls do: a row for each pair, direction, source and cell."""
+        """Return the estimated effect of every patch, and the measured effect of `best_cells` and their nulls.
+
+        There is a row for each pair, direction, source and cell.
+        """
         paths = set[Path]()
         estimates = self._each("estimates", self._estimates, paths)
         best = best_cells(estimates, self._settings, self._model.n_layers)
         patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
         store = self._workspace.store
-        store.remove({*store.below(self._folder)} - paths)  # of other settings or items
+        store.remove({*store.below(self._folder)} - paths)  # files of other settings or items
         return estimates, patches
 
     def _each(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:
-        """Return the rows of all pairs: read where a file holds them, else made and written."""
+        """Return the rows of all pairs, from their files or computed and written."""
         rows, store = list[Row](), self._workspace.store
         for number, name in enumerate(self._names, start=1):
             path = self._folder / f"{name}-{self._version}-{kind}.json"
@@ -175,18 +177,18 @@ class Pairs:
             del plain  # before the other side's pass is recorded
 
     def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
-        """Return the margins of both sides, and the estimated change by each token; the states are gone afterwards."""
+        """Return the margins of both sides, and the estimated change by each token; free the states afterwards."""
         plain = record(self._model, target.prompt, self._tokens, ())
         source = record(self._model, own.prompt, self._tokens, self._settings.sites)
         return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
 
-    def _patched(self, target: Recorded, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
-        """Return the margin of a source, and the changes by patches from it; its states are gone afterwards."""
+    def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
+        """Return the margin of a source, and the changes by patches from it; free its states afterwards."""
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
-        """Yield each side of a pair that has both, with the other side and the groups of positions."""
+        """Yield each side of a complete pair, with the other side and the groups of positions."""
         if all((name, side) in self._items for side in SIDES):
             for into, towards in (SIDES, SIDES[::-1]):
                 target, own = self._side(name, into), self._side(name, towards)
@@ -234,7 +236,7 @@ def _row(
     ends: tuple[float, float],
     change: float,
 ) -> Row:
-    """Return what a patch does to one pair. ends: the outcomes of the side that is patched and of the other one."""
+    """Return the effect of a patch on one pair. ends: the outcomes of the patched side and of the other one."""
     site, layer, group = cell
     about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
     return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
@@ -246,7 +248,7 @@ def _fits(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) ->
 
 
 def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
-    """Return the groups of positions of a pair, (T,) bool each; None if the two prompts have another form.
+    """Return the groups of positions of a pair, (T,) bool each; None if the two prompts have different forms.
 
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
@@ -262,8 +264,11 @@ def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
 
 
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
-    """Return the cells to patch: of each direction those with the largest estimates over all pairs, at every so many
-    layers. All positions of the residual stream are left out, whose effect is 1 by construction."""
+    """Return the cells to patch: for each direction those with the largest estimates over all pairs.
+
+    Only every so many layers count. All positions of the residual stream together are left out; their effect is 1 by
+    construction.
+    """
     layers = {*range(0, n_layers + 1, settings.stride), n_layers}
     sums = defaultdict[Cell, float](float)
     for row in estimates:
@@ -275,11 +280,13 @@ def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: i
     return sorted(cell for cells in by_size for cell in cells)
 
 
-def summed(
+def summarize_effects(
     estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
 ) -> Iterator[PatchingRow]:
-    """Yield the rows of a dataset: ratios of sums over pairs, with intervals by scenario for what was patched. Where
-    all pairs were left out, a row without an effect says so."""
+    """Yield the rows of a dataset: ratios of sums over pairs, with intervals by scenario for measured patches.
+
+    If all pairs were left out, a row without an effect says so.
+    """
     left_out = Counter((row["into"], row["source"]) for row in (*estimates, *patches) if "left_out" in row)
     cells = [defaultdict[tuple[Any, ...], list[Row]](list), defaultdict[tuple[Any, ...], list[Row]](list)]
     for by_cell, rows in zip(cells, (estimates, patches), strict=True):
@@ -323,9 +330,9 @@ def effect_of(
 ) -> tuple[float | None, float | None, float | None]:
     """Return the indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each).
 
-    It is sum(after - before) over sum(there - before), each (pairs,): a ratio of sums, since the ratio of a pair whose
+    It is sum(after - before) over sum(target - before), each (pairs,): a ratio of sums, since the ratio of a pair whose
     sides hardly differ is noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's
-    width. None where the sides do not differ at all.
+    width. None if the sides do not differ at all.
     """
     moved, apart = after - before, target - before
     if not apart.sum():

@@ -1,8 +1,8 @@
-"""Answers that several processes make for one evaluation, of which one alone may write the ledger.
+"""Share the generation of an evaluation's answers between processes, of which only one may write the ledger.
 
-Who may not write makes answers in the meantime, chunk by chunk of its calls and from their end, and leaves them in the
-study; who writes takes what is there and makes the rest. A chunk is leased as it is made, so nobody makes it twice, and
-a process that dies gives it back.
+The others generate answers meanwhile, in chunks from the end of the calls, and store them in the study; the writer
+takes these and generates the rest. A chunk is leased while it is generated, so none is made twice; leases of dead
+processes expire.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 
-Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # calls; whether to stop; their outcomes
+Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # (calls, is stopped) -> outcomes
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Calls that one process makes together, by key; another process has the same ones in a chunk of the same name."""
+    """Calls that one process answers together, by key; equal calls have the same chunk name in every process."""
 
     name: str
     calls: Mapping[str, Request]
 
 
-class MadeAnswers:
-    """The answers in a folder of a study, and the chunks of the calls that are wanted here."""
+class SharedAnswers:
+    """The stored answers of a study, and the chunks of the calls wanted here."""
 
     def __init__(self, store: Store, folder: Path, size: int) -> None:
         self._store, self._folder, self._size = store, folder, size
         self._of: dict[str, Chunk] = {}
 
     def chunks(self, requests: Sequence[Request]) -> list[Chunk]:
-        """Return the calls of a cell in chunks, which are known from now on."""
+        """Split a cell's calls into chunks, register these, and return them."""
         calls = list({request.key: request for request in requests}.values())
         parts = [calls[first : first + self._size] for first in range(0, len(calls), self._size)]
         result = [Chunk(digest([each.key for each in part])[:16], {each.key: each for each in part}) for part in parts]
@@ -49,8 +49,10 @@ class MadeAnswers:
         return result
 
     def outcomes(self, requests: Sequence[Request], make: Make, stopped: Callable[[], bool]) -> list[Outcome]:
-        """Return what came of calls, which are of known chunks: as another process made them, or made here. Waits while
-        another process makes some of them, unless it is stopped."""
+        """Return the outcomes of calls of known chunks, from another process or generated here.
+
+        Waits while another process generates some of them, unless it is stopped.
+        """
         chunks = {chunk.name: chunk for request in requests if (chunk := self._of.get(request.key))}
         with ExitStack() as leases:
             known: dict[str, Outcome] = {}
@@ -66,7 +68,7 @@ class MadeAnswers:
         return [known[request.key] for request in requests]
 
     def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
-        """Make the answers of a chunk that are not known, unless another process is at it (None); their number."""
+        """Generate a chunk's unknown answers and return their number; None if another process is working on it."""
         lease = self._lease(chunk)
         if lease is None:
             return None
@@ -82,7 +84,7 @@ class MadeAnswers:
             return len(missing)
 
     def forget(self, requests: Sequence[Request]) -> None:
-        """Remove the answers to calls that the ledger holds now."""
+        """Remove the answers to calls that the ledger holds by now."""
         chunks = {chunk.name: chunk for request in requests if (chunk := self._of.get(request.key))}
         self._store.remove(map(self._path, chunks.values()))
         with suppress(OSError):  # unless there are others
@@ -97,18 +99,18 @@ class MadeAnswers:
             return {key: Outcome(**row) for key, row in rows.items() if key in chunk.calls}
         except FileNotFoundError:
             return {}
-        except (ValueError, TypeError, AttributeError):  # not what was written: made again
+        except (ValueError, TypeError, AttributeError):  # damaged: generate it again
             return {}
 
     def _lease(self, chunk: Chunk) -> Lease | None:
         lease = self._store.lease(f"{self._folder.name}/{chunk.name}")
         if lease is not None:
-            self._store.look()  # what whoever had it before has left
+            self._store.look()  # remains of the former holder
         return lease
 
 
 def is_written(ledger: Ledger, evaluation: str) -> bool:
-    """Return whether another process writes an evaluation now."""
+    """Return whether another process is writing an evaluation now."""
 
     async def try_it() -> bool:
         try:
@@ -121,15 +123,17 @@ def is_written(ledger: Ledger, evaluation: str) -> bool:
 
 
 def make_meanwhile(
-    shared: MadeAnswers,
+    shared: SharedAnswers,
     ledger: Ledger,
     evaluation: str,
     wanted: Sequence[Request],
     make: Make,
     tick: Callable[[int, int], None],
 ) -> int:
-    """Make answers to these calls from their end, for as long as another process writes their evaluation; returns how
-    many were made. tick: gets the chunks done and their number."""
+    """Generate answers from the end of these calls, while another process writes their evaluation.
+
+    Return their number. tick: receives the chunks done and their number.
+    """
     chunks, count = shared.chunks(wanted), 0
     for done, chunk in enumerate(reversed(chunks), start=1):
         count += shared.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0

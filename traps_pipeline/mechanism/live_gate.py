@@ -1,5 +1,4 @@
-"""A gate in memory, which decides about prompts that are shown to a model now: the same probe and threshold as those
-that the gate stage counts, for a notebook."""
+"""A fitted gate for live prompts in a notebook, with the probe and threshold that the gate stage evaluates."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
-from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.capture import OF_PARTS, Pooling
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import DATASETS
@@ -35,8 +34,8 @@ class Gate:
     pooling: Pooling
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
-        """Return the probe's log-odds of void for a prompt: one pass of the plain model."""
-        with model.remembering_clips():
+        """Return the probe's log-odds of void for a prompt, from one pass of the plain model."""
+        with model.caching_clips():
             states = model.forward_states(prompt, self.pooling).raw[self.layer]
         return float(self.probe.scores(states[None])[0])
 
@@ -45,9 +44,7 @@ class Gate:
         return self.score(model, prompt) > self.threshold
 
     def answer(self, model: LocalModel, prompt: Prompt, max_new_tokens: int = 512) -> str:
-        """Return the model's greedy answer to a prompt, or ABSTENTION where the gate abstains, without generating
-        any.
-        """
+        """Return the model's greedy answer to a prompt, or ABSTENTION, without generating, if the gate abstains."""
         return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
 
 
@@ -63,10 +60,9 @@ def fitted_gate(
 ) -> Gate:
     """Return a gate of a source, one of `gate.SOURCES`, fitted on the study's stored states.
 
-    target: the dataset that `other datasets` leaves out. layer: that of the gate stage by default. without: scenarios,
-    or families as `gate.families` names them, that the gate must not have seen. Raises TrapsError for another source or
-    threshold, for a source without both sides in as many scenarios as there are folds, and for states that are means
-    over a part of the prompt.
+    target: the dataset that `other datasets` leaves out. layer: default: that of the gate stage. without: scenarios, or
+    families as `gate.families` names them, to hold out. Raises TrapsError for another source or threshold, for a source
+    without both sides in as many scenarios as there are folds, and for states that are means over a part of the prompt.
     """
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     if threshold not in THRESHOLDS:

@@ -1,7 +1,8 @@
-"""Models, judges and panels of one's own, which need no change of a tracked file.
+"""User-defined models, judges and panels, which need no change of a tracked file.
 
-They stand in an experiment's YAML, and in `own.yaml` of the workspace that it was run in. An entry there has the fields
-of the registry's and may be short: an address, and what the server takes of a clip. The protocol fills in the rest.
+They are defined in an experiment's YAML, and copied to `own.yaml` of the workspace in which it runs. An entry has the
+registry's fields and may be short: an address, and the form of clips that the server takes. The protocol supplies the
+rest.
 """
 
 from __future__ import annotations
@@ -26,14 +27,16 @@ HOW_MEDIA = (
     "media: say what your server takes of a clip: `images` (25 JPEG frames as image_url; most servers take them) "
     "or `video` (the clip as one mp4 in video_url; vLLM with a video model)"
 )
-SHORT = ("base_url", "served_name", "key")  # fields of a short entry, which the registry's entries have elsewhere
+SHORT = ("base_url", "served_name", "key")  # fields of a short entry, which complete entries have elsewhere
 Kind = Literal["models", "judges"]
 Cached = TypeVar("Cached")
 
 
-class Own(BaseModel):
-    """What an experiment or a workspace adds to the registries, in the form of `assets/models.yaml` and
-    `assets/judges.yaml`, or short."""
+class UserRegistry(BaseModel):
+    """Additions of an experiment or a workspace to the registries.
+
+    Entries are in the form of `assets/models.yaml` and `assets/judges.yaml`, or short.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     accounts: dict[Name, dict[str, Any]] = {}
@@ -48,13 +51,13 @@ class Own(BaseModel):
             raise ValueError("each entry has an `id`, a word in lower case with hyphens")
         return values
 
-    def __or__(self, newer: Own) -> Own:
-        """Return these, with the newer entries in the place of those of the same name."""
+    def __or__(self, newer: UserRegistry) -> UserRegistry:
+        """Return the union, in which newer entries replace those of the same name."""
 
         def entries(kind: Kind) -> list[dict[str, Any]]:
             return [*{entry["id"]: entry for own in (self, newer) for entry in getattr(own, kind)}.values()]
 
-        return Own(
+        return UserRegistry(
             accounts=self.accounts | newer.accounts,
             models=entries("models"),
             judges=entries("judges"),
@@ -63,78 +66,77 @@ class Own(BaseModel):
 
     @property
     def all_accounts(self) -> dict[str, dict[str, Any]]:
-        """The accounts, with one for each entry that has an address of its own."""
+        """The accounts, with one for each entry that has its own address."""
         short = [entry for entry in (*self.models, *self.judges) if "base_url" in entry]
         accounts = {_account(entry): {k: entry[k] for k in ("base_url", "key") if k in entry} for entry in short}
         return self.accounts | accounts
 
 
-_overlay: list[tuple[Path, Own]] = []  # of the experiment that a command names
-_forget: list[Callable[[], None]] = []  # what is kept of the registries, and how to forget it
+_overlay: list[tuple[Path, UserRegistry]] = []  # additions of the command's experiment
+_clearers: list[Callable[[], None]] = []  # clear the caches of the registries
 
 
-def keeps(cached: Cached) -> Cached:
-    """Mark a cached reader of a registry: it reads again when other entries are added. For use as a decorator."""
-    _forget.append(cached.cache_clear)  # pyright: ignore[reportAttributeAccessIssue] - of functools.cache
+def cached_registry(cached: Cached) -> Cached:
+    """Register a cached reader of a registry, whose cache is cleared when entries are added. A decorator."""
+    _clearers.append(cached.cache_clear)  # pyright: ignore[reportAttributeAccessIssue] - of functools.cache
     return cached
 
 
-def forget() -> None:
-    """Read the registries again when they are next asked for."""
-    for clear in _forget:
+def clear_caches() -> None:
+    """Clear the caches of the registries, so that they are read again."""
+    for clear in _clearers:
         clear()
 
 
-def use(own: Own, path: Path) -> None:
-    """Add what an experiment's file brings, for this process. path: the file, for errors."""
+def add_entries(own: UserRegistry, path: Path) -> None:
+    """Add the entries of an experiment's file, for this process. path: the file, for errors."""
     _overlay[:] = [(path, own)]
-    forget()
+    clear_caches()
 
 
-def keep(workspace: Workspace) -> None:
-    """Write what the experiment brought into the workspace, where every run reads it, whoever starts it."""
-    additions = [own for _, own in _overlay if own != Own()]
+def save_entries(workspace: Workspace) -> None:
+    """Write the experiment's entries into the workspace, where every run reads them."""
+    additions = [own for _, own in _overlay if own != UserRegistry()]
     if additions:
         path = Workspace.file_of(workspace.place, FILE)
-        together = (_read(path) if path else Own()) | additions[-1]
+        together = (_read(path) if path else UserRegistry()) | additions[-1]
         workspace.store.write({workspace.root / FILE: _yaml(together).encode()})
-        forget()
+        clear_caches()
 
 
-def sources() -> list[tuple[Path, Own]]:
-    """Return what is added to the registries, each with the file that brings it: the workspace's, then the
-    experiment's."""
+def sources() -> list[tuple[Path, UserRegistry]]:
+    """Return all additions, each with its file: the workspace's, then the experiment's."""
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
 
-def together() -> Own:
-    """Return all of `sources` in one."""
-    combined = Own()
+def together() -> UserRegistry:
+    """Return the union of all `sources`."""
+    combined = UserRegistry()
     for _, own in sources():
         combined |= own
     return combined
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
-    """Return all accounts that are added."""
+    """Return all added accounts."""
     return together().all_accounts
 
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
-    """Return models or judges that are added, written out in full, each with its file."""
+    """Return the added models or judges, completed, each with its file."""
     newest = {raw["id"]: (path, raw) for path, own in sources() for raw in getattr(own, kind)}
     return ((path, _whole(raw, kind)) for path, raw in newest.values())
 
 
-def _read(path: Path) -> Own:
+def _read(path: Path) -> UserRegistry:
     try:
-        return Own.model_validate(read_yaml(path) or {})
+        return UserRegistry.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        raise TrapsError(f"{path}: {explain(error, Own)}") from error
+        raise TrapsError(f"{path}: {explain(error, UserRegistry)}") from error
 
 
-def _yaml(own: Own) -> str:
+def _yaml(own: UserRegistry) -> str:
     import yaml
 
     head = "# Models, judges and panels of this study, from its experiments' files (docs/models.md).\n"
@@ -146,7 +148,7 @@ def _account(entry: Mapping[str, Any]) -> str:
 
 
 def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
-    """Return an entry with all fields that a registry's has, from one that may be short."""
+    """Return a possibly short entry with all fields of a registry's entry."""
     entry = {name: value for name, value in raw.items() if name not in SHORT}
     if "base_url" not in raw:
         return entry
@@ -167,8 +169,8 @@ def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
 
 
 def _params(protocol: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is sent: the protocol's parameters and the entry's own; one that is null is left out."""
-    replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # another name of the same limit
+    """Return the parameters to send: the protocol's and the entry's own, without nulls."""
+    replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # the same limit
     params = {name: value for name, value in protocol.items() if name not in replaced}
     return {name: value for name, value in (params | {**own}).items() if value is not None}
 
@@ -180,7 +182,7 @@ def _media(media: Any) -> Any:
 
 
 def _is_here(address: str) -> bool:
-    """Return whether an address is this machine's, where nobody sends a bill."""
+    """Return whether an address is this machine's, so that calls are free."""
     host = urlsplit(address).hostname or ""
     try:
         return ip_address(host).is_loopback

@@ -18,11 +18,18 @@ from tests.conftest import ROOT
 from tests.local_models import SYSTEM, ask, clip, model
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.mechanism import patched
+from traps_pipeline.mechanism import patching_stage
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.patched import Side, best_cells, effect_of, groups_of, patching_rows, summed
-from traps_pipeline.mechanism.patching_effects import Patch, Recorded, record
+from traps_pipeline.mechanism.patching_effects import Patch, RecordedPass, record
+from traps_pipeline.mechanism.patching_stage import (
+    Side,
+    best_cells,
+    effect_of,
+    groups_of,
+    patching_rows,
+    summarize_effects,
+)
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.spans import changed_tokens, spans
@@ -90,7 +97,7 @@ def test_rows_count_flips_among_pairs_that_could_flip_and_say_which_were_left_ou
         left_out("d", "control", "other scenario"),
         change("a", -2.0, 0.0, 2.0, source="other scenario"),
     ]
-    rows = {(row.into, row.source, row.group): row for row in summed(estimates, patches, TINY, "chaotic", 0)}
+    rows = {(row.into, row.source, row.group): row for row in summarize_effects(estimates, patches, TINY, "chaotic", 0)}
     assert set(rows) == {
         ("control", "pair", "stamps"), ("control", "pair", "last"), ("control", "other scenario", "stamps"),
         ("void", "other scenario", "all"),
@@ -110,7 +117,7 @@ def test_rows_count_flips_among_pairs_that_could_flip_and_say_which_were_left_ou
 
 
 def test_no_flips_are_reported_where_no_pair_could_flip() -> None:
-    (row,) = summed([], [change("a", 1.0, -1.0, 2.0)], TINY, "chaotic", 0)
+    (row,) = summarize_effects([], [change("a", 1.0, -1.0, 2.0)], TINY, "chaotic", 0)
     assert row.effect == -2.0 and row.flips is None and row.n_flippable == 0
 
 
@@ -235,21 +242,23 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     assert len(names) == 2 * 2 * PAIRS  # no two of them alike
 
     prompts: dict[int, tuple[str, str, str]] = {}
-    kept: list[Recorded] = []
+    kept: list[RecordedPass] = []
     pairs: list[tuple[tuple[str, str, str], tuple[str, str, str]]] = []
 
-    def recording(of: LocalModel, prompt: Prompt, *rest: Any) -> Recorded:
+    def recording(of: LocalModel, prompt: Prompt, *rest: Any) -> RecordedPass:
         recorded = record(of, prompt, *rest)
         kept.append(recorded)  # or another one might get its address
         prompts[id(recorded)] = names[content(prompt)]
         return recorded
 
-    def changes(_: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], __: Any) -> np.ndarray:
+    def changes(
+        _: LocalModel, target: RecordedPass, source: RecordedPass, patches: Sequence[Patch], __: Any
+    ) -> np.ndarray:
         pairs.append((prompts[id(target)], prompts[id(source)]))
         return np.full(len(patches), float(pairs[-1][0][1] != pairs[-1][1][1]))  # 1 for frames of the other side
 
-    monkeypatch.setattr(patched, "record", recording)
-    monkeypatch.setattr(patched, "patched_changes", changes)
+    monkeypatch.setattr(patching_stage, "record", recording)
+    monkeypatch.setattr(patching_stage, "patched_changes", changes)
     made = patching_rows(workspace, entry, TINY)
     order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)
     fitting = [name for name in order if name != "plinko-2"]
@@ -268,7 +277,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     assert {row.source for row in made} == {"pair", "other scenario", "same side", "other times"}
     cells = [
         {(row.into, row.site, row.layer, row.group) for row in made if row.source == source and row.effect is not None}
-        for source in patched.SOURCES
+        for source in patching_stage.SOURCES
     ]
     assert len(cells[0]) == 2 * 6 and all(of_null == cells[0] for of_null in cells)
 
@@ -281,7 +290,7 @@ def test_a_killed_run_goes_on_behind_its_last_pair_and_gives_the_same_rows(entry
     described.write_text(entry.model_dump_json(), "utf-8")
     workspaces = [make_study(tmp_path / name) for name in ("killed", "alone")]
     for workspace in workspaces:
-        for dataset in patched.WELL_POSED:
+        for dataset in patching_stage.WELL_POSED:
             workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
 
     def start(workspace: Workspace) -> subprocess.Popen[str]:

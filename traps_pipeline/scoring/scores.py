@@ -1,4 +1,4 @@
-"""All figures of a leaderboard from verdicts, as the stages of the scoring group make them one after another."""
+"""Compute all figures of a leaderboard from verdicts, as the stages of the scoring group do one after another."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from traps_pipeline.scoring.standings import leaderboard
 
 
 @dataclass(frozen=True)
-class Scored:
+class Scores:
     """METRICS and LEADERBOARD rows of the same verdicts."""
 
     metrics: pd.DataFrame
     board: pd.DataFrame
 
 
-def score(verdicts: pd.DataFrame) -> Scored:
-    """Return the figures of VERDICTS rows of the pairs, of any models, regimes and runs."""
+def score(verdicts: pd.DataFrame) -> Scores:
+    """Return the METRICS and LEADERBOARD rows of VERDICTS rows of the pairs (any models, regimes and runs)."""
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
     resampled = resample(verdicts)
     paired = contrasts(resampled, cells, verdicts)
-    return Scored(cells, leaderboard(cells, intervals(resampled), paired))
+    return Scores(cells, leaderboard(cells, intervals(resampled), paired))

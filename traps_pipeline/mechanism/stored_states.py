@@ -26,7 +26,7 @@ class StoredStates:
 
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """Return the states of an extraction. Raises TrapsError when nothing was extracted."""
+        """Return the states of an extraction. Raises TrapsError if nothing was extracted."""
         items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
@@ -34,7 +34,7 @@ class StoredStates:
 
     @property
     def n_layers(self) -> int:
-        """Layers, the embeddings included."""
+        """Number of layers, the embeddings included."""
         return int(self.items["n_layers"].iloc[0]) + 1
 
     @property

@@ -9,7 +9,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models import own
+from traps_pipeline.models import user_registry
 from traps_pipeline.models.judges import load_panel, panel_id, thinking_of
 from traps_pipeline.models.registry import account_of, get_model, load_models
 from traps_pipeline.pipeline.experiment import load_experiment
@@ -39,7 +39,7 @@ def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.delenv(VARIABLE, raising=False)
     yield
     monkeypatch.undo()
-    own.use(own.Own(), Path("none"))
+    user_registry.add_entries(user_registry.UserRegistry(), Path("none"))
 
 
 def written(tmp_path: Path, text: str) -> str:
@@ -98,17 +98,17 @@ def test_a_panel_of_one_judge_of_ones_own_has_a_version(tmp_path: Path) -> None:
 
 def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load_experiment(written(tmp_path, MINE))
-    own.keep(Workspace(tmp_path, Study(name="lab")))
-    own.use(own.Own(), Path("none"))
+    user_registry.save_entries(Workspace(tmp_path, Study(name="lab")))
+    user_registry.add_entries(user_registry.UserRegistry(), Path("none"))
     with raises(TrapsError, "models.registry.get_model", "my-model"):
         get_model("my-model")
     monkeypatch.setenv(VARIABLE, str(tmp_path))
-    own.forget()
+    user_registry.clear_caches()
     assert get_model("my-model").provider_id == "openai/org/Model-7B"
     newer = MINE.replace("Model-7B", "Model-8B") + JUDGES
     load_experiment(written(tmp_path, newer))
-    own.keep(Workspace(tmp_path, Study(name="lab")))
-    own.use(own.Own(), Path("none"))
+    user_registry.save_entries(Workspace(tmp_path, Study(name="lab")))
+    user_registry.add_entries(user_registry.UserRegistry(), Path("none"))
     assert get_model("my-model").provider_id == "openai/org/Model-8B" and len(load_panel("one")) == 1
 
 

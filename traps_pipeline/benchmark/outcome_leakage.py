@@ -1,0 +1,62 @@
+"""Measure how well the state at a void's cut predicts the outcome, for a model that knows all poses.
+
+The certificate `open` proves for each record that its futures disagree. A family's records may still have something in
+common: if a ball on the left ends on the left more often than not, a rule that has seen enough records predicts the
+outcome without knowing physics.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+FOLDS, SEED = 5, 0
+AT_MOST = 0.05  # maximum accuracy above always giving the commonest outcome
+FEWEST = 100  # records of a family; fewer cannot tell such a leakage from chance
+
+
+@dataclass(frozen=True)
+class OutcomeLeakage:
+    """Accuracy of predicting the outcomes.
+
+    best: of the better of two cross-validated classifiers of the states, which favours them; prior: of always giving
+    the commonest outcome.
+    """
+
+    best: float
+    prior: float
+
+    @property
+    def gain(self) -> float:
+        """Accuracy that the state adds to the commonest outcome."""
+        return self.best - self.prior
+
+
+def outcome_leakage(states: Sequence[Sequence[float] | np.ndarray], outcomes: Sequence[str]) -> OutcomeLeakage | None:
+    """Return how well states (one per record, of any lengths) predict outcomes.
+
+    None if some outcome is rarer than the number of folds.
+    """
+    from sklearn.ensemble import ExtraTreesClassifier
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.model_selection import StratifiedKFold, cross_val_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    counts = Counter(outcomes)
+    if not counts or min(counts.values()) < FOLDS:
+        return None
+    width = max(map(len, states))
+    features = np.stack([np.pad(np.asarray(state), (0, width - len(state))) for state in states])
+    classifiers = (
+        make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000)),
+        ExtraTreesClassifier(300, min_samples_leaf=3, random_state=SEED),
+    )
+    folds = StratifiedKFold(FOLDS, shuffle=True, random_state=SEED)
+    best = max(
+        float(cross_val_score(classifier, features, list(outcomes), cv=folds).mean()) for classifier in classifiers
+    )
+    return OutcomeLeakage(best, max(counts.values()) / len(outcomes))
