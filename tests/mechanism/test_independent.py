@@ -25,6 +25,7 @@ from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
 from traps_pipeline.mechanism.probes import auroc, fit_probe
+from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
@@ -197,7 +198,7 @@ def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: 
         )
         for number, steering in rows
     ]  # fmt: skip
-    backend = SteeredBackend(of.entry, vectors, MadeAnswers(FolderStore(tmp_path), tmp_path, len(requests)))
+    backend = SteeredBackend(of.entry, vectors, SharedAnswers(FolderStore(tmp_path), tmp_path, len(requests)))
     before = of.of.clips.passes
     found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
     assert of.of.clips.passes - before <= 2  # clips, of classes whose features come clip by clip

@@ -78,7 +78,7 @@ class AsItIs:
         return states[:, 0]
 
 
-def scored(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
+def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
     """Return the rows of the protocol on features in the place of states, those of nearest centroids included. fit:
     another probe than the protocol's."""
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)

@@ -272,7 +272,7 @@ class LocalModel:
         progress.current().note(f"{self.checkpoint.name}: {len(rows)} rows do not fit into memory, trying half of them")
         return None
 
-    def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> Generated:
+    def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> GeneratedAnswer:
         eos = self.network.generation_config.eos_token_id
         ends = {eos} if isinstance(eos, int) else {*eos}
         ended = next((i for i, token in enumerate(tokens) if token in ends), None)
