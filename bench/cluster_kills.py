@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -346,7 +347,9 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
         in_bucket = workspace.is_shared
         shutil.copytree(alone / "clips", workspace.root / "clips", dirs_exist_ok=True)
     said = study.traps("run", str(study.experiment), "--until", "items")
-    study.require(" 0 frames rendered" in said.stdout, "clips that are there are not rendered again")
+    study.require(
+        bool(re.search(r"(?m)^0 frames rendered", said.stdout)), "clips that are there are not rendered again"
+    )
     study.start_daemon()
     scene.opens.counts.clear()  # what nodes open for this study, not for the one before
     provider.reset()

@@ -62,4 +62,4 @@ def test_a_fresh_checkout_without_assets_says_what_it_is(tmp_path: Path) -> None
     root = make_checkout(tmp_path / "half")
     subprocess.run(["rm", "-r", root / "scene_specs"], check=True)
     finished = Checkout(root, tmp_path / "none").traps("run", ROOT / EXPERIMENT)
-    assert_refused(finished, "scene_specs is missing", "clone the repository")
+    assert_refused(finished, "scene_specs/released: holds no released records", "restore it from git")

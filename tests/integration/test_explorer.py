@@ -208,16 +208,14 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
             assert (only_left, only_right, p) == (test["only_left"], test["only_right"], printed(test["p"]))
         voids = verdicts.loc[(verdicts["dataset"] == "chaotic") & (verdicts["side"] == "void")]
         by = voids.loc[voids["regime"] == "standard"].pivot(index="item_id", columns="model", values="abstained")
-        left, right = by["oracle"].astype(bool), by["random-50"].astype(bool)
-        page = visited.go(
-            "#/compare?left=oracle&right=random-50&leftRegime=standard&rightRegime=standard&dataset=chaotic"
-        )
+        left, right = by["oracle"].astype(bool), by["prior"].astype(bool)
+        page = visited.go("#/compare?left=oracle&right=prior&leftRegime=standard&rightRegime=standard&dataset=chaotic")
         numbers, p = counted(page)
         only = int((left & ~right).sum()), int((right & ~left).sum())
         assert numbers == [int((left & right).sum()), *only, int((~left & ~right).sum())]
         assert p == printed(binomtest(only[0], sum(only), 0.5).pvalue)
         key = ["kind", "dataset", "figure", "left_model", "left_regime", "right_model"]
-        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"]
+        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "prior"]
         lines = {(line["Dataset"], line["Figure"]): line for line in by_heading(page, "differences")}
         assert lines["Chaotic", "PECS"]["Difference"] == fraction(found["difference"])
         interval = f"[{fraction(found['ci_low'])}, {fraction(found['ci_high'])}]"

@@ -9,7 +9,8 @@ import pytest
 from tests.conftest import Checkout
 from tests.mechanism.paper_run import BLOCKS, DEPTHS, mechanism, paper, write
 from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
-from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.storage.workspace import Workspace
 
 SCENARIOS = ["domino_chain-0001", "domino_chain-0002", "plinko-0001", "plinko-0002"]
@@ -50,7 +51,9 @@ def test_the_papers_layers_sweep_doses_and_paths_are_run_on_all_three_families(
         assert set(mine["layer"]) == {layers["steering"], *layers.get("sweep", [])}  # of Gemma also the sweep
         assert set(mine["alpha"]) >= {0, *settings["steering"]["alphas"]}
         voids = mine.loc[(mine["kind"] == "void") & (mine["layer"] == layers["steering"])]
-        assert len(voids[["source", "target"]].drop_duplicates()) >= 14  # both path sets
+        # A direction has seen every pair of its own taxonomy: there are two scenarios of each.
+        steered = {(row.source, row.target) for row in voids.itertuples()}
+        assert steered == {path for path in STEERING_PATHS if len({*map(taxonomy_of, path)}) == 2}
         assert set(zip(voids["directions"], voids["regime"], strict=True)) == {
             (a, b) for a in ("standard", "guided") for b in ("standard", "guided")
         }

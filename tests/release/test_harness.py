@@ -97,12 +97,19 @@ def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
         assert items[row["item_id"]]["question"] == row["question"]
 
 
+def is_for_types(node: ast.stmt) -> bool:
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
 def test_its_code_is_the_pipelines_own_and_needs_nothing_of_it(harness: Path) -> None:
     paths = [*(harness / "traps_harness").glob("*.py")]
     for path in paths:
+        tree = ast.parse(path.read_text())
+        for_types = {id(each) for node in tree.body if is_for_types(node) for each in ast.walk(node)}
         names = [
             name
-            for node in ast.walk(ast.parse(path.read_text()))
+            for node in ast.walk(tree)
+            if id(node) not in for_types
             if isinstance(node, ast.Import | ast.ImportFrom)
             for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names])
         ]

@@ -8,9 +8,11 @@ correction made while they were off.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import dagster as dg
+from sqlalchemy.exc import IntegrityError
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
@@ -99,7 +101,7 @@ def _stages(costs: bool) -> list[Stage]:
     return [stage for stage in the_graph().stages if costs or not stage.cost]
 
 
-def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
+def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
     """Fail the check `current` for altered or lost files, and for stale assets without partitions.
 
     reported: the failures that this process has reported before.
@@ -115,15 +117,22 @@ def _report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: 
             text = f"{name_of((stage.name, key))}: {'; '.join(wrong)}"
             if wrong and text not in reported:
                 reported.add(text)
-                instance.report_runless_asset_event(
-                    dg.AssetCheckEvaluation(
-                        asset_key=asset_key(stage.name),
-                        check_name=CURRENT,
-                        passed=False,
-                        partition=key,
-                        metadata={"not current": "; ".join(wrong)},
-                    )
-                )
+                _report(instance, stage.name, key, "; ".join(wrong))
+
+
+def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: str) -> None:
+    """Fail the check `current` of a partition outside of any run."""
+    failed = partial(
+        dg.AssetCheckEvaluation,
+        asset_key=asset_key(stage),
+        check_name=CURRENT,
+        passed=False,
+        metadata={"not current": wrong, "partition": key or "all"},
+    )
+    try:
+        instance.report_runless_asset_event(failed(partition=key))
+    except IntegrityError:  # Dagster stores one evaluation without a run for each partition; the next is of the asset
+        instance.report_runless_asset_event(failed(partition=None))
 
 
 def _requests(
@@ -165,7 +174,7 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
         opened = workspace.open()
         lineage = Lineage(opened)
         History(context.instance, the_graph()).observe(lineage)
-        _report_unseen(context.instance, opened, lineage, reported)
+        report_unseen(context.instance, opened, lineage, reported)
         if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
             return dg.SkipReason("runs are under way")
         requests = _requests(context.instance, opened, lineage, costs=costs)
