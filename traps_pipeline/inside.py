@@ -25,7 +25,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.hook import Site, changing
 from traps_pipeline.mechanism.live_gate import Gate, Threshold, fitted_gate
-from traps_pipeline.mechanism.other_probes import erase_side as erase_side
+from traps_pipeline.mechanism.other_probes import erased as erased
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, fit_probe

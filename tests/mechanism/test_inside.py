@@ -160,7 +160,7 @@ def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_e
     void = np.arange(60) % 2 == 1
     states = rng.normal(size=(60, 8)) * rng.lognormal(size=8)
     states[void, :2] += 5
-    gone = inside.erase_side(states, void)
+    gone = inside.erased(states, void)
     assert np.abs(gone[void].mean(axis=0) - gone[~void].mean(axis=0)).max() < 1e-9
     assert np.linalg.matrix_rank(gone - gone.mean(axis=0)) == 7
     assert np.abs(LogisticRegression().fit(gone, void).coef_).max() < 1e-4

@@ -46,7 +46,7 @@ class _Estimator:
         return np.log(chance / (1 - chance))
 
 
-def erase_side(states: np.ndarray, void: np.ndarray) -> np.ndarray:
+def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
     """Return states (n, d) from which no linear classifier can tell the sides, void (n,).
 
     Least-squares concept erasure (LEACE, of Belrose et al. 2023) of these very states: the smallest change, in the
