@@ -39,7 +39,7 @@ check: setup ## lint, types and fast tests: two minutes on two cores
 fast-tests: setup
 	$(PYTEST) -n 2 $(FAST)
 
-test: setup browser ## check, and one real path for each promise of the documentation: eight minutes
+test: setup browser ## check, and one real path for each promise of the documentation: 10 to 15 minutes
 	$(MAKE) --no-print-directory -j2 --output-sync=line lint promises
 
 # What is compiled is copied to the checkouts of the tests, whose commands would each compile it again. One worker more

@@ -1,8 +1,8 @@
 """The paper's mechanistic experiment on tiny checkpoints of its three families.
 
-The section `mechanism` is that of `assets/experiments/paper.yaml` but for five things: layers are those of a few blocks
-at the same share of the depth, frames are few and small, the scenarios are too few for five folds, one pair a cell is
-steered, and answers are short, since a random model never ends one.
+The section `mechanism` is that of `assets/experiments/paper.yaml` but for six things: layers are those of a few blocks
+at the same share of the depth, frames are few and small, the scenarios are too few for five folds, a direction
+comes from two pairs and steers another, and answers are short, since a random model never ends one.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def mechanism() -> dict[str, Any]:
             found = sorted({shallow(one, model) for one in deep})
             layers[name] = found if isinstance(layer, list) else found[0]
     section["probes"]["folds"] = 2
-    section["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1}
+    section["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1, "well_posed_pairs": 2, "ill_posed_pairs": 2}
     return section
 
 

@@ -9,11 +9,10 @@ import pytest
 from tests.conftest import Checkout
 from tests.mechanism.paper_run import BLOCKS, DEPTHS, mechanism, paper, write
 from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
-from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS
-from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
-SCENARIOS = ["domino_chain-0001", "domino_chain-0002", "plinko-0001", "plinko-0002"]
+SCENARIOS = [f"{family}-000{n}" for family in ("domino_chain", "plinko") for n in (1, 2, 3)]
 
 
 def test_the_tiny_checkpoints_are_asked_what_the_papers_models_are() -> None:
@@ -21,7 +20,7 @@ def test_the_tiny_checkpoints_are_asked_what_the_papers_models_are() -> None:
     assert {name for name in real if tiny[name] != real[name]} == {"models", "probes", "steering"}
     assert tiny["probes"] == real["probes"] | {"folds": 2}
     differ = {name for name in real["steering"] if tiny["steering"][name] != real["steering"][name]}
-    assert differ == {"pairs", "max_new_tokens"}
+    assert differ == {"pairs", "max_new_tokens", "well_posed_pairs", "ill_posed_pairs"}
     layers = {model: (each["steering"], each.get("sweep")) for model, each in tiny["models"].items()}
     # 20 of 36 blocks, of four: 2.2; 35 of 42 with 1 and 17, of six: 5 with 0.1 and 2.4; 28 of 32, of four: 3.5.
     assert layers == {"qwen3-vl-8b": (2, None), "gemma-4-e4b": (5, [1, 2]), "llava-next-video-7b": (4, None)}
@@ -51,9 +50,7 @@ def test_the_papers_layers_sweep_doses_and_paths_are_run_on_all_three_families(
         assert set(mine["layer"]) == {layers["steering"], *layers.get("sweep", [])}  # of Gemma also the sweep
         assert set(mine["alpha"]) >= {0, *settings["steering"]["alphas"]}
         voids = mine.loc[(mine["kind"] == "void") & (mine["layer"] == layers["steering"])]
-        # A direction has seen every pair of its own taxonomy: there are two scenarios of each.
-        steered = {(row.source, row.target) for row in voids.itertuples()}
-        assert steered == {path for path in STEERING_PATHS if len({*map(taxonomy_of, path)}) == 2}
+        assert len(voids[["source", "target"]].drop_duplicates()) >= 14  # both path sets
         assert set(zip(voids["directions"], voids["regime"], strict=True)) == {
             (a, b) for a in ("standard", "guided") for b in ("standard", "guided")
         }
