@@ -53,10 +53,10 @@ QUIET = ["--no-sandbox", "--disable-gpu", "--enable-precise-memory-info"]
 # --- a made-up study --------------------------------------------------------------------------------------------------
 
 WORDS = {  # of the templates below, by their slot
-    "o": "ball|block|domino|panel|ramp|marble|lever|cube|plank|wall|gate|peg|bin|die|cylinder|wedge",
+    "o": "ball|block|domino|occluder|ramp|marble|lever|cube|plank|wall|gate|peg|bin|die|cylinder|wedge",
     "c": "red|cyan|yellow|green|blue|orange|purple|grey|white|black",
     "m": "rolls|slides|falls|bounces|tips|swings|stops|turns|rises|drops|leans|spins",
-    "p": "left|right|the far end|the near edge|the middle|behind the panel|the top of the ramp|its lowest point",
+    "p": "left|right|the far end|the near edge|the middle|behind the occluder|the top of the ramp|its lowest point",
 }
 SLOTS = {slot: words.split("|") for slot, words in WORDS.items()}
 SAID = (

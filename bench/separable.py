@@ -30,7 +30,7 @@ from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.shortcut_rules import CUT_FRAMES, names_no_choices
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN
-from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.variants.arms import SHOWN_AGAIN_S
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
@@ -67,7 +67,7 @@ class Clip:
 
     camera: Camera
     qpos: np.ndarray
-    board: Panel | None = None
+    board: Occluder | None = None
     start: int = 0
     stop: int = 0
 
@@ -107,9 +107,9 @@ def asked_of(spec: SceneSpec) -> Iterator[tuple[str, str, str, Clip]]:
     camera, closing = Camera.from_record(spec.camera), closing_of(spec)
     shown = Clip(camera, load_trajectory(trajectory, spec.trajectory_sha256))
     n, end = len(shown.qpos), len(shown.qpos) if closing is None else closing.frame
-    control = shown if closing is None else replace(shown, board=closing.panel, start=end, stop=n)
+    control = shown if closing is None else replace(shown, board=closing.occluder, start=end, stop=n)
     occluder = spec.void_kind == "occluder"
-    board = Panel.from_record(spec.void["panel"]) if occluder else None
+    board = Occluder.from_record(spec.void["panel"]) if occluder else None
     cut = n if occluder else int(spec.void["cut_frame"])
     void = Clip(camera, shown.qpos[:cut], board, 0, n)
     twin = Clip(camera, load_trajectory(trajectory, spec.twin.trajectory_sha256, "twin"))

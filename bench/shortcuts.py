@@ -1,8 +1,8 @@
 """What a benchmark can be passed by, other than by seeing: measured on its records, and on a study of its arms.
 
 From the records (two frames of each are drawn, about three minutes on two cores): how many controls the family's own
-observer answers from the last shown frame alone, and how many nobody can, since a panel hides the outcome there
-(certificate `closing`); what of a void's pixels over which anything moves its panel covers, and whether all that the
+observer answers from the last shown frame alone, and how many nobody can, since an occluder hides the outcome there
+(certificate `closing`); what of a void's pixels over which anything moves its occluder covers, and whether all that the
 question names shows there (certificate `referents`); when outcomes settle, and until when they are in view; how many
 records of a family have a neighbour whose first frame looks like theirs; how far each seesaw turns; how well the state
 at the cut predicts the outcome of a chaotic record, beside always saying the commonest outcome. With --observer also
@@ -112,7 +112,7 @@ def measure(spec: SceneSpec, folder: Path, whole: bool = False) -> Measured:
     shown = range(0, len(qpos), STEP)
     with world.closed_renderer() as renderer:
         (first,) = renderer.frames(qpos[:1])
-        (last,) = renderer.frames(qpos[[shown[-1]]], panel=world.open_frames <= shown[-1])
+        (last,) = renderer.frames(qpos[[shown[-1]]], occluder=world.open_frames <= shown[-1])
     see = world.family.observe
     answer = see(np.stack([last] * len(shown)), spec.question) if see is not None else None
     return Measured(
@@ -187,7 +187,9 @@ def print_voids(found: Sequence[Measured]) -> None:
     shown = [one.referents for one in found if one.referents is not None]
     if covers:
         spread = " ".join(f"{value:5.2f}" for value in np.quantile(covers, (0, 0.25, 0.5, 0.75, 1)))
-        print(f"\nPixels over which anything moves that the panel covers, as shares (least, quartiles, most): {spread}")
+        print(
+            f"\nPixels over which anything moves that the occluder covers, as shares (least, quartiles, most): {spread}"
+        )
         print(f"Voids in which all that the question names shows, or was seen moving: {sum(shown)} of {len(shown)}")
 
 

@@ -1,6 +1,6 @@
 """A ball rolls along a plank towards a tray; the question is whether it gets there.
 
-Control: plank and tray are in view. Void: the panel stands before all but the beginning of the plank.
+Control: plank and tray are in view. Void: the occluder stands before all but the beginning of the plank.
 Hidden element: a post that stands in the ball's way, or behind the plank.
 """
 
@@ -35,8 +35,8 @@ class Params:
     post_in_way: bool = hidden(False, True)
     radius_m: float = between(0.045, 0.055)
     speed_m_s: float = between(0.55, 0.75)
-    seen_m: float = between(0.55, 0.65)  # plank before the panel
-    before_m: float = between(0.25, 0.35)  # from the panel to the post
+    seen_m: float = between(0.55, 0.65)  # plank before the occluder
+    before_m: float = between(0.25, 0.35)  # from the occluder to the post
     after_m: float = between(0.15, 0.25)  # from the post to the tray
     tray_m: float = between(0.20, 0.26)
     azimuth_deg: float = facing(-15, 18)

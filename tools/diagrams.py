@@ -111,7 +111,7 @@ def pair() -> str:
         text(572, 181, "proves", SOFT, 12),
         arrow((260, 189), (315, 189)),
         text(287, 181, "one edit", SOFT, 12),
-        box(60, 285, 230, "occlusion", "a panel hides what decides", ORANGE),
+        box(60, 285, 230, "occlusion", "an occluder hides what decides", ORANGE),
         box(315, 285, 230, "chaotic", "the clip ends before the outcome", ORANGE),
         box(570, 285, 230, "ill-posed", "the question asks the unseen", ORANGE),
         arrow((430, 213), (430, 285)),

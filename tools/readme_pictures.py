@@ -25,7 +25,7 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import decode
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-SCENARIO, SHOWN_S = "hidden_drop-0001", 3.1  # then a panel closes the control
+SCENARIO, SHOWN_S = "hidden_drop-0001", 3.1  # then an occluder closes the control
 SHEET = Layout(6.4, 0.95, 0.5, letters=108, questions=2, ids=True, moments=4, columns=2, dpi=150, size=8)
 ON_SHEET = ("tumbling_dice-0006", "domino_chain-0005")
 HOLD_MS = 2600  # the last frame, with the answers
@@ -60,7 +60,7 @@ def _frame(pair: Sequence[np.ndarray], question: str, answers: tuple[str, str] |
     frame = Image.new("RGB", (2 * WIDTH + GAP, HEAD + HEIGHT + FOOT), "white")
     draw = ImageDraw.Draw(frame)
     draw.multiline_text((0, 4), textwrap.fill(question, 56), fill=INK, font=_font(22, bold=True))
-    for at, (picture, said) in enumerate(zip(pair, ("the outcome can be seen", "a panel hides it"), strict=True)):
+    for at, (picture, said) in enumerate(zip(pair, ("the outcome can be seen", "an occluder hides it"), strict=True)):
         x = at * (WIDTH + GAP)
         draw.text((x, 68), f"{('control', 'void')[at]}: {said}", fill=SOFT, font=_font(21))
         frame.paste(Image.fromarray(picture).resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS), (x, HEAD))

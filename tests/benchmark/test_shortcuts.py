@@ -15,10 +15,10 @@ from traps_pipeline.video.encode import encode
 SCENARIOS = 10
 
 
-def _clip(path: Path, rng: np.random.Generator, frames: int, panel: bool) -> dict[str, object]:
+def _clip(path: Path, rng: np.random.Generator, frames: int, occluder: bool) -> dict[str, object]:
     video = np.full((frames, 96, 128, 3), 180, np.uint8)
     video[:, 60:80, 10 : 20 + rng.integers(80)] = rng.integers(0, 255, 3)  # scenes differ
-    if panel:
+    if occluder:
         video[:, 20:50, 40:90] = (20, 30, 90)
     encode(list(video), path, 10)
     return {"path": path.name, "duration_s": frames / 10, "size_bytes": path.stat().st_size}
@@ -26,7 +26,7 @@ def _clip(path: Path, rng: np.random.Generator, frames: int, panel: bool) -> dic
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
-    """occlusion: a panel in the void's first frame; chaotic: the void is shorter; ill-posed: another question."""
+    """occlusion: an occluder in the void's first frame; chaotic: the void is shorter; ill-posed: another question."""
     root, rng = tmp_path_factory.mktemp("clips"), np.random.default_rng(0)
     items: list[dict[str, str]] = []
     clips: list[dict[str, object]] = []
@@ -34,7 +34,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
         for k in range(SCENARIOS):
             name = f"{taxonomy}-{k}"
             scene = np.random.default_rng(k)
-            clips.append(_clip(root / f"{name}-control.mp4", scene, 10, panel=False))
+            clips.append(_clip(root / f"{name}-control.mp4", scene, 10, occluder=False))
             scene = np.random.default_rng(k)  # the same scene again
             hidden = taxonomy == "occlusion"
             clips.append(_clip(root / f"{name}-void.mp4", scene, 10 if hidden else 5 + int(rng.integers(3)), hidden))

@@ -19,14 +19,14 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 EXPERIMENT = """
 name: with-arms
-models: [oracle, any-rule, panel-rule]
+models: [oracle, any-rule, occluder-rule]
 regimes: [standard]
 panel: rules
 epoch: small
 scenarios: [hidden_race-0001, plinko-0001]
 datasets:
   [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, decoy, twin_control, crossed,
-   labels_two, labels_six, panel_grey, schema_abstain, frames_few, graded]
+   labels_two, labels_six, occluder_grey, schema_abstain, frames_few, graded]
 """
 
 
@@ -69,7 +69,7 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     board_text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
     assert "all over 3 of 7 arms" in board_text and "nan" not in board_text and "no conjunction" not in board_text
     doses = tables.read_all(HYPOTHESES).set_index(["model", "hypothesis", "dose"])
-    grey = doses.loc[("panel-rule", "panel", "grey")]
+    grey = doses.loc[("occluder-rule", "occluder", "grey")]
     assert (grey["at_reference"], grey["value"], grey["rule_change"]) == (1.0, 0.0, -1.0)
     assert doses.loc[("oracle", "schema", "reason, abstain, final_answer"), "j"] == 1.0
     assert doses.loc[("oracle", "answer space", "6 answers"), "chance"] == pytest.approx(1 / 6)

@@ -17,8 +17,8 @@ from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.reference import ABSTENTION
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, PANEL_PX, RULES, names_no_choices
-from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, Look
+from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, OCCLUDER_PX, RULES, names_no_choices
+from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, Look
 from traps_pipeline.scenes.parts.vision import largest_board
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.picture.render import Renderer
@@ -58,12 +58,12 @@ def abstains(rule: str, media: Path, question: str) -> bool:
     ("what", "question", "abstaining"),
     [
         ({}, CHOICES, set()),
-        ({"patch": 60}, CHOICES, {"panel", "any"}),
+        ({"patch": 60}, CHOICES, {"occluder", "any"}),
         ({"frames": 23}, CHOICES, {"length", "any"}),
         ({"frames": 24}, CHOICES, set()),
         ({}, OPEN, {"wording", "any"}),
         ({"patch": 60, "frames": 20}, OPEN, {*RULES}),
-        ({"patch": 20}, CHOICES, set()),  # 400 pixels of dark blue are a shade and no panel
+        ({"patch": 20}, CHOICES, set()),  # 400 pixels of dark blue are a shade and no occluder
         ({"patch": 60, "from_frame": 30}, CHOICES, set()),  # the first frame alone is looked at
     ],
 )
@@ -75,18 +75,20 @@ def test_a_rule_abstains_by_its_own_cue_and_by_no_other(
 
 
 @pytest.mark.slow  # fifteen renderers
-@pytest.mark.parametrize("panel", PANELS)
-def test_the_panel_rule_sees_panels_of_every_colour_and_material_and_no_panel_where_there_is_none(panel: str) -> None:
+@pytest.mark.parametrize("occluder", OCCLUDERS)
+def test_the_occluder_rule_sees_occluders_of_every_colour_and_material_and_no_occluder_where_there_is_none(
+    occluder: str,
+) -> None:
     case = load("bounce-0001")
     for material in MATERIALS:
-        look = Look(panel=panel, material=material, light=(0.8, 0.82, 0.85))
+        look = Look(panel=occluder, material=material, light=(0.8, 0.82, 0.85))
         world = replace(World.of_record(case.spec, case.qpos), params=replace(case.params, look=look))
         with world.renderer() as renderer:
             (control,) = renderer.frames(case.qpos[:1])
             control = control.copy()
-            (void,) = renderer.frames(case.qpos[:1], panel=True)
-        assert largest_board(control, PANEL_PX) is None
-        board = largest_board(void, PANEL_PX)
+            (void,) = renderer.frames(case.qpos[:1], occluder=True)
+        assert largest_board(control, OCCLUDER_PX) is None
+        board = largest_board(void, OCCLUDER_PX)
         assert board is not None and board.area > 0.8 * (void != control).any(axis=2).sum()
 
 
@@ -122,12 +124,12 @@ def test_every_released_chaotic_void_is_shorter_than_a_control() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["stack-0001", "transfer-0001", "topple-0001"])  # dark blue specks, no panel
-def test_the_panel_is_seen_in_an_occlusion_void_and_not_in_its_control(tmp_path: Path, scenario_id: str) -> None:
+@pytest.mark.parametrize("scenario_id", ["stack-0001", "transfer-0001", "topple-0001"])  # dark blue specks, no occluder
+def test_the_occluder_is_seen_in_an_occlusion_void_and_not_in_its_control(tmp_path: Path, scenario_id: str) -> None:
     case = load(scenario_id)
-    model, _ = compile_scene(case.family, case.params, case.physics, case.panel)
+    model, _ = compile_scene(case.family, case.params, case.physics, case.occluder)
     with Renderer(model, case.camera) as renderer:
-        for side, panel in (("control", False), ("void", True)):
+        for side, occluder in (("control", False), ("void", True)):
             media = tmp_path / f"{scenario_id}-{side}.mp4"
-            encode(list(renderer.frames(case.qpos[:1], panel=panel)), media, 10)
-            assert CUES["panel"](str(media), media, case.spec.question) == panel
+            encode(list(renderer.frames(case.qpos[:1], occluder=occluder)), media, 10)
+            assert CUES["occluder"](str(media), media, case.spec.question) == occluder

@@ -17,7 +17,7 @@ from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Family, Physics
-from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.picture.checks import closing_frames
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene
@@ -54,43 +54,44 @@ class Released:
         return Camera.from_record(self.spec.camera)
 
     @property
-    def panel(self) -> Panel | None:
-        return Panel.from_record(self.spec.void["panel"]) if self.spec.void_kind == "occluder" else None
+    def occluder(self) -> Occluder | None:
+        return Occluder.from_record(self.spec.void["panel"]) if self.spec.void_kind == "occluder" else None
 
     @cached_property
     def control_frames(self) -> np.ndarray:
         """The control as it is sampled, (25, 360, 480, 3)."""
-        return self._closing(panel=False)
+        return self._closing(occluder=False)
 
-    def _closing(self, *, panel: bool) -> np.ndarray:
+    def _closing(self, *, occluder: bool) -> np.ndarray:
         world = World.of_record(self.spec, self.qpos)
         with world.closed_renderer() as renderer:
-            return np.stack(list(closing_frames(renderer, self.qpos[SAMPLED], world.board[SAMPLED], panel=panel)))
+            return np.stack(list(closing_frames(renderer, self.qpos[SAMPLED], world.board[SAMPLED], occluder=occluder)))
 
     @cached_property
     def void(self) -> np.ndarray:
         """The void as it is sampled, (n, 360, 480, 3)."""
-        if self.panel is None:
+        if self.occluder is None:
             return self.control_frames[: -(-self.spec.void["cut_frame"] // 2)]
-        return self._closing(panel=True)
+        return self._closing(occluder=True)
 
-    def void_behind(self, panel_rgb: tuple[float, float, float]) -> np.ndarray:
-        """The void with its panel in another colour. Only the first frame is drawn: nothing passes before a panel, so
-        its pixels are the same in all frames, but for a few at its edges where something is seen to move."""
-        assert self.panel is not None
-        first = self._behind(self.panel, self.qpos[:1], panel_rgb)[0]
+    def void_behind(self, occluder_rgb: tuple[float, float, float]) -> np.ndarray:
+        """The void with its occluder in another colour. Only the first frame is drawn: nothing passes before an
+        occluder, so its pixels are the same in all frames, but for a few at its edges where something is seen to
+        move."""
+        assert self.occluder is not None
+        first = self._behind(self.occluder, self.qpos[:1], occluder_rgb)[0]
         frames, changed = self.void.copy(), (first != self.void[0]).any(axis=-1)
         frames[:, changed] = first[changed]
         return frames
 
     def _behind(
-        self, panel: Panel, qpos: np.ndarray, panel_rgb: tuple[float, float, float] | None = None
+        self, occluder: Occluder, qpos: np.ndarray, occluder_rgb: tuple[float, float, float] | None = None
     ) -> np.ndarray:
-        model, _ = compile_scene(self.family, self.params, self.physics, panel)
-        if panel_rgb is not None:
-            model.geom_rgba[model.geom("cover_panel").id, :3] = panel_rgb
+        model, _ = compile_scene(self.family, self.params, self.physics, occluder)
+        if occluder_rgb is not None:
+            model.geom_rgba[model.geom("occluder").id, :3] = occluder_rgb
         with Renderer(model, self.camera) as renderer:
-            return np.stack(list(renderer.frames(qpos, panel=True)))
+            return np.stack(list(renderer.frames(qpos, occluder=True)))
 
 
 def load(scenario_id: str, folder: Path = RELEASED) -> Released:

@@ -68,21 +68,21 @@ def test_a_scenario_without_a_partner_or_with_one_that_its_scene_does_not_refute
 
 
 @pytest.mark.slow
-def test_panels_of_arms_come_stand_and_go_as_they_say():
+def test_occluders_of_arms_come_stand_and_go_as_they_say():
     bounce = scenario("bounce-0001")
     control, void = bounce.control_frames, bounce.void_frames
     removed, goes = arms.ARMS["removed"].film(bounce), len(control) - 10  # 1.0 s before the end
     assert all(np.array_equal(a, b) for a, b in zip(removed.frames, [*void[:goes], *control[goes:]], strict=True))
-    with pytest.raises(Rejected, match="first of the two events that are asked about happens behind the panel"):
+    with pytest.raises(Rejected, match="first of the two events that are asked about happens behind the occluder"):
         arms.ARMS["removed"].film(scenario("hidden_race-0001"))
-    with pytest.raises(Rejected, match="before the panel comes the two worlds differ in 0 pixels"):
-        arms.ARMS["late_panel"].film(scenario("hidden_race-0001"))
-    late = arms.ARMS["late_panel"].film(bounce)
+    with pytest.raises(Rejected, match="before the occluder comes the two worlds differ in 0 pixels"):
+        arms.ARMS["late_occluder"].film(scenario("hidden_race-0001"))
+    late = arms.ARMS["late_occluder"].film(bounce)
     at = round(late.evidence["covered_from_s"] * bounce.fps)
     assert at == bounce.control.outcome.commit_frame - 1  # never so late that the outcome was seen
     assert all(np.array_equal(a, b) for a, b in zip(late.frames, [*control[:at], *void[at:]], strict=True))
     decoy = arms.ARMS["decoy"].film(bounce)
-    assert len(decoy.frames) == len(control) and decoy.evidence["panel_px"] >= arms.PANEL_PX
+    assert len(decoy.frames) == len(control) and decoy.evidence["panel_px"] >= arms.OCCLUDER_PX
     assert decoy.evidence["hides_px"] == 0
 
 
@@ -93,7 +93,7 @@ def test_cuts_of_a_board_are_matched_and_predictable_and_a_settled_one_is_not():
     matched = arms.ARMS["length_matched"].film(plinko)
     assert len(matched.frames) == cut
     assert plinko.spec.closes_frame == 45
-    assert np.array_equal(matched.frames[-1], plinko.control_frames[44])  # the last one before the panel
+    assert np.array_equal(matched.frames[-1], plinko.control_frames[44])  # the last one before the occluder
     predictable = arms.ARMS["predictable_cut"].film(plinko)
     assert predictable.evidence["agree"] >= arms.AGREE_SHARE * arms.FUTURES
     assert cut < len(predictable.frames) < plinko.control.outcome.commit_frame

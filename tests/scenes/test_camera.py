@@ -1,4 +1,4 @@
-"""Camera and panel are fitted: everything that must be seen is seen, everything that must be hidden is hidden."""
+"""Camera and occluder are fitted: everything that must be seen is seen, everything that must be hidden is hidden."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from traps_pipeline.scenes.physics.kit import Box, Physics, View, add_box, new_s
 from traps_pipeline.scenes.picture.camera import (
     FRAME_FILL,
     HEIGHT,
-    PANEL_GAP,
+    OCCLUDER_GAP,
     WIDTH,
     Camera,
-    Panel,
+    Occluder,
     fit_camera,
-    fit_panel,
+    fit_occluder,
     fit_shot,
     in_frame,
 )
@@ -83,47 +83,47 @@ def test_a_point_at_the_edge_of_the_frame_is_out() -> None:
     assert not in_frame(camera, np.array([[0, 0, -2.01]]))
 
 
-def assert_hidden(camera: Camera, panel: Panel, cover: Box) -> None:
-    """Rays from the eye to points all over the cover box meet the panel's front face first."""
-    yaw = np.radians(panel.yaw_deg)
+def assert_hidden(camera: Camera, occluder: Occluder, cover: Box) -> None:
+    """Rays from the eye to points all over the cover box meet the occluder's front face first."""
+    yaw = np.radians(occluder.yaw_deg)
     across, ahead = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
     eye = camera.position()
     inside = np.random.default_rng(4).uniform(cover.low, cover.high, size=(200, 3))
     points = np.concatenate([cover.corners(), inside])
-    front = panel.centre @ ahead - panel.half[1]
+    front = occluder.centre @ ahead - occluder.half[1]
     depth = (points - eye) @ ahead
     meets = (front - eye @ ahead) / depth
     assert ((meets > 0) & (meets < 1)).all()
-    hits = eye + (points - eye) * meets[:, None] - panel.centre
-    assert (np.abs(hits @ across) <= panel.half[0] + 1e-6).all()
-    assert (np.abs(hits[:, 2]) <= panel.half[2] + 1e-6).all()
+    hits = eye + (points - eye) * meets[:, None] - occluder.centre
+    assert (np.abs(hits @ across) <= occluder.half[0] + 1e-6).all()
+    assert (np.abs(hits[:, 2]) <= occluder.half[2] + 1e-6).all()
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_panel_hides_the_whole_cover_box_and_stands_in_front_of_it(view: View) -> None:
+def test_the_occluder_hides_the_whole_cover_box_and_stands_in_front_of_it(view: View) -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         low = np.array([*rng.uniform(-1, 1, size=2), rng.uniform(0.0, 0.3)])
         cover = Box(tuple(low), tuple(low + rng.uniform(0.05, 0.8, size=3)))  # type: ignore[arg-type]
         everything = np.concatenate([cover.corners(), rng.uniform((-1.5, -1.5, 0), (1.5, 1.5, 3), size=(10, 3))])
         camera = fit_camera(view, everything)
-        panel = fit_panel(camera, cover)
-        assert_hidden(camera, panel, cover)
-        assert panel.centre[2] == pytest.approx(panel.half[2], abs=1e-5)  # it stands on the floor
-        yaw = np.radians(panel.yaw_deg)
+        occluder = fit_occluder(camera, cover)
+        assert_hidden(camera, occluder, cover)
+        assert occluder.centre[2] == pytest.approx(occluder.half[2], abs=1e-5)  # it stands on the floor
+        yaw = np.radians(occluder.yaw_deg)
         ahead = np.array([-np.sin(yaw), np.cos(yaw), 0])
-        gap = (cover.corners() @ ahead).min() - (panel.corners() @ ahead).max()
-        assert gap == pytest.approx(PANEL_GAP, abs=1e-5)
+        gap = (cover.corners() @ ahead).min() - (occluder.corners() @ ahead).max()
+        assert gap == pytest.approx(OCCLUDER_GAP, abs=1e-5)
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_camera_and_panel_fit_together(view: View) -> None:
+def test_camera_and_occluder_fit_together(view: View) -> None:
     cover = Box((-0.6, -0.3, 0.0), (0.2, 0.3, 0.5))
     points = np.concatenate([cover.corners(), Box((-0.8, -0.2, 0.0), (0.9, 0.2, 0.6)).corners()])
-    camera, panel = fit_shot(view, points, cover)
-    assert panel is not None
-    assert_hidden(camera, panel, cover)
-    assert in_frame(camera, np.concatenate([points, panel.corners()]))
+    camera, occluder = fit_shot(view, points, cover)
+    assert occluder is not None
+    assert_hidden(camera, occluder, cover)
+    assert in_frame(camera, np.concatenate([points, occluder.corners()]))
     alone, none = fit_shot(view, points, None)
     assert none is None
     assert alone == fit_camera(view, points)

@@ -64,22 +64,22 @@ def failures(case: Released, spec: SceneSpec) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_a_lowered_panel_hides_nothing_and_betrays_the_twin(race: Released) -> None:
-    panel = dict(race.spec.void["panel"])
-    x, y, z = panel["centre"]
-    across, thickness, up = panel["half"]
-    low = panel | {"centre": [x, y, z / 4], "half": [across, thickness, up / 4]}
+def test_a_lowered_occluder_hides_nothing_and_betrays_the_twin(race: Released) -> None:
+    occluder = dict(race.spec.void["panel"])
+    x, y, z = occluder["centre"]
+    across, thickness, up = occluder["half"]
+    low = occluder | {"centre": [x, y, z / 4], "half": [across, thickness, up / 4]}
     found = failures(race, altered(race.spec, void=race.spec.void | {"panel": low}))
     assert {"hidden", "ablation", "twin"} <= set(found)
     assert "pixels" in found["hidden"]
 
 
-def test_a_panel_that_rises_over_the_flags_hides_what_the_question_names() -> None:
+def test_an_occluder_that_rises_over_the_flags_hides_what_the_question_names() -> None:
     case = load("chain-0001")
-    panel = dict(case.spec.void["panel"])
-    x, y, z = panel["centre"]
-    across, thickness, up = panel["half"]
-    high = panel | {"centre": [x, y, 1.5 * z], "half": [across, thickness, 1.5 * up]}
+    occluder = dict(case.spec.void["panel"])
+    x, y, z = occluder["centre"]
+    across, thickness, up = occluder["half"]
+    high = occluder | {"centre": [x, y, 1.5 * z], "half": [across, thickness, 1.5 * up]}
     spec = altered(case.spec, void=case.spec.void | {"panel": high})
     measured, said = {}, {}
     for name, record in (("released", case.spec), ("raised", spec)):
@@ -238,7 +238,7 @@ GOOD: dict[str, Any] = {
         "cause_moving_s": 0.5,
         "panel_covers": 0.6,
     },
-    "twin behind panel": {"hidden_alone": True, "twin_answer": CLAIM.twin_answer, "twin_px": 0},
+    "twin behind occluder": {"hidden_alone": True, "twin_answer": CLAIM.twin_answer, "twin_px": 0},
     "cut": {"last_shown_s": 1.0, "cut_s": 1.1, "commit_s": 1.1},
     "open": {
         "entropy_bits": 1.0,
@@ -298,10 +298,10 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("referents", {"referents_px": 79.75}, "has 80 pixels in a void frame"),
     ("referents", {"referents_moving_s": 0.4}, "the question names is seen moving for 0.4 s"),
     ("referents", {"cause_moving_s": 0.4}, "the cause is seen moving for 0.4 s"),
-    ("twin behind panel", {"hidden_alone": False}, "in more, or in less, than the hidden element"),
-    ("twin behind panel", {"twin_answer": CLAIM.answer}, "the twin ends in"),
-    ("twin behind panel", {"twin_answer": None}, "the twin ends in None"),
-    ("twin behind panel", {"twin_px": 1}, "differs from the void: in 1 pixels"),
+    ("twin behind occluder", {"hidden_alone": False}, "in more, or in less, than the hidden element"),
+    ("twin behind occluder", {"twin_answer": CLAIM.answer}, "the twin ends in"),
+    ("twin behind occluder", {"twin_answer": None}, "the twin ends in None"),
+    ("twin behind occluder", {"twin_px": 1}, "differs from the void: in 1 pixels"),
     ("cut", {"last_shown_s": 0.9, "cut_s": 1.0}, "is before 1.0 s or after commitment"),
     ("cut", {"cut_s": 1.2}, "is before 1.0 s or after commitment"),
     ("open", {"accepted": 63}, "63 futures"),
@@ -314,16 +314,16 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("twin of cut", {"twin_deviation_px": 0.51}, "0.51 pixels off before the cut"),
     ("twin of cut", {"start_off": 2.6e-7}, "begins 2.6e-07 beside the start that the record names"),
     ("twin of cut", {"rebuilt": False}, "its trajectory is of another start"),
-    ("closing", {"read_answer": "teal"}, "before the panel comes the control shows 'teal'"),
+    ("closing", {"read_answer": "teal"}, "before the occluder comes the control shows 'teal'"),
     ("closing", {"read_s": 0.7}, "less than 0.8 s after the outcome has settled"),
     ("closing", {"commit_s": 3.8}, "less than 0.8 s after the outcome has settled"),
-    ("closing", {"closes_s": 4.6}, "some model is shown no frame after 4.5 s"),
-    ("closing", {"closed_px": 0.25}, "0.25 pixels of what the panel must hide are seen past it"),
+    ("closing", {"closes_s": 4.6}, "a model is shown no frame after 4.5 s"),
+    ("closing", {"closed_px": 0.25}, "0.25 pixels of what the occluder must hide are seen past it"),
     ("closing", {"closed_change_px": 1}, "the outcome changes 1 pixels of the control's end"),
     ("exchange", {"other_settings": ["length", "camera"]}, "the length and the camera would be another"),
     ("exchange", {"lost_exchanged": "pace: too late"}, "with the twin as the control: pace: too late"),
     ("exchange", {"hidden_from_s": 3.7}, "does not hide the outcome of the twin before it is settled"),
-    ("exchange", {"twin_read_answer": "teal"}, "before the panel comes the twin shows 'teal'"),
+    ("exchange", {"twin_read_answer": "teal"}, "before the occluder comes the twin shows 'teal'"),
     ("exchange", {"twin_commit_s": 3.8}, "less than 0.8 s after the twin's outcome has settled"),
     ("words", {"ill_posed_for": None}, "has no answer"),
     ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
@@ -351,8 +351,8 @@ def test_evidence_beyond_a_threshold_is_not(name: str, worse: dict[str, Any], sa
 
 
 def test_a_twin_that_ends_as_its_scenario_does_is_refused_though_its_record_says_so_too() -> None:
-    alike, good = replace(CLAIM, twin_answer=CLAIM.answer), GOOD["twin behind panel"] | {"twin_answer": CLAIM.answer}
-    assert "the twin ends in" in str(JUDGES["twin behind panel"].failure(good, alike))
+    alike, good = replace(CLAIM, twin_answer=CLAIM.answer), GOOD["twin behind occluder"] | {"twin_answer": CLAIM.answer}
+    assert "the twin ends in" in str(JUDGES["twin behind occluder"].failure(good, alike))
 
 
 def test_a_seesaw_that_nothing_strikes_loses_and_what_turns_nothing_is_not_asked() -> None:

@@ -14,8 +14,8 @@ from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.stored_evidence import answerable_voids
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, pair_of
-from traps_pipeline.scenes.parts.vision import after_panel, before_hold, before_panel
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Panel
+from traps_pipeline.scenes.parts.vision import after_occluder, before_hold, before_occluder
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Occluder
 from traps_pipeline.scenes.picture.checks import closing_frames
 from traps_pipeline.scenes.picture.coming_board import LANDED, coming_board
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -33,7 +33,7 @@ def test_the_last_frame_that_every_policy_comes_to_is_the_last_of_two_a_second()
     assert last_of_all(50, 10) == 45  # 5 a second ends at 4.8 s, 16 evenly spaced at 4.9 s, 2 a second at 4.5 s
 
 
-def test_before_a_panel_comes_its_last_frames_are_those_that_are_shown_before_it() -> None:
+def test_before_an_occluder_comes_its_last_frames_are_those_that_are_shown_before_it() -> None:
     # From 3.4 to 4.0 s. 5 a second: 3.4, 3.6, 3.8, 4.0. Of 16, 0.327 s apart: 3.6, 3.9. 2 a second: 3.5, 4.
     assert shown_at_end(50, 10, 0.6, 41) == [34, 35, 36, 38, 39, 40]
 
@@ -49,7 +49,7 @@ def test_every_released_control_closes_that_has_the_time_and_most_of_each_taxono
         assert commit + 8 <= closes <= 45, spec.scenario_id
         assert closes >= min(commit + 10, 45), spec.scenario_id
         assert (spec.evidence["closed_px"], spec.evidence["closed_change_px"]) == (0, 0)
-    assert all(shares["occlusion"])  # so a panel at the end tells nothing of the side
+    assert all(shares["occlusion"])  # so an occluder at the end tells nothing of the side
     assert np.mean(shares["chaotic"]) > 0.5
     times = Counter(spec.closes_frame for spec in load_released().values() if spec.taxonomy == "occlusion")
     assert len(times) > 20 and times.most_common(1)[0][1] < 20
@@ -67,8 +67,8 @@ def test_a_board_comes_before_a_control_and_its_void_alike_and_both_end_in_the_s
     assert board[0] is None and board[1] is not None and board[1][2] > 0.2 and board[2:] == [LANDED, LANDED]
     with world.closed_renderer() as renderer:
         control = list(closing_frames(renderer, case.qpos[at], board))
-        void = list(closing_frames(renderer, case.qpos[at], board, panel=True))
-        still = list(renderer.frames(case.qpos[at], panel=True))
+        void = list(closing_frames(renderer, case.qpos[at], board, occluder=True))
+        still = list(renderer.frames(case.qpos[at], occluder=True))
     assert [np.array_equal(a, b) for a, b in zip(control, void, strict=True)] == [False, False, True, True]
     assert [np.array_equal(a, b) for a, b in zip(void, still, strict=True)] == [True, False, True, True]
 
@@ -77,8 +77,8 @@ def test_a_board_falls_as_things_fall_from_above_the_picture() -> None:
     # From y = -2 m, half a metre up, 90 degrees high: the back of the falling board, at -0.8 - 0.202 m, leaves the
     # picture 0.998 m above the eye, that is after 1.498 m. It falls so far in 0.55 s.
     camera = Camera((0.0, 0.0, 0.5), 2.0, 90.0, 0.0, 90.0, 1.0, (0.0, 0.0, 0.5))
-    panel = Panel((0.0, -0.9, 0.3), (0.2, 0.1, 0.3), 0.0)
-    board = coming_board(Closing(8, panel), camera, 10, 10)
+    occluder = Occluder((0.0, -0.9, 0.3), (0.2, 0.1, 0.3), 0.0)
+    board = coming_board(Closing(8, occluder), camera, 10, 10)
     landing = np.sqrt(2 * 9.81 * 1.5)
     heights = [landing * t - 9.81 * t**2 / 2 for t in (0.1, 0.2, 0.3, 0.4, 0.5)]
     assert board[:3] == [None] * 3 and board[8:] == [LANDED] * 2
@@ -106,28 +106,28 @@ def test_a_released_control_is_closed_and_one_that_closes_too_early_or_too_late_
         failure(scenario_id, altered(spec, closes_frame=early))
     )
     late = altered(spec, closes_frame=46)
-    assert "some model is shown no frame after 4.5 s" in str(failure(scenario_id, late))
+    assert "a model is shown no frame after 4.5 s" in str(failure(scenario_id, late))
     # The table of records finds it too, without a trajectory.
     assert [said.partition(": closing: ")[2][:26] for said in answerable_voids([late])] == [
-        "the panel comes at 4.6 s; "
+        "the occluder comes at 4.6 s; "
     ]
 
 
-def test_a_panel_that_is_too_small_or_beside_the_outcome_closes_nothing() -> None:
+def test_an_occluder_that_is_too_small_or_beside_the_outcome_closes_nothing() -> None:
     spec = load_released()[BOARD]
     assert spec.control is not None
-    panel = spec.control["panel"]
-    across, thick, high = panel["half"]
-    x, y, z = panel["centre"]
+    occluder = spec.control["panel"]
+    across, thick, high = occluder["half"]
+    x, y, z = occluder["centre"]
     for worse in ({"half": [across, thick, high / 4], "centre": [x, y, z / 4]}, {"centre": [x + 2 * across, y, z]}):
-        said = str(failure(BOARD, altered(spec, panel=panel | worse)))
-        assert "pixels of what the panel must hide are seen past it" in said
+        said = str(failure(BOARD, altered(spec, panel=occluder | worse)))
+        assert "pixels of what the occluder must hide are seen past it" in said
 
 
-def test_legibility_and_order_are_measured_before_the_panel_comes() -> None:
+def test_legibility_and_order_are_measured_before_the_occluder_comes() -> None:
     case = load(RACE)
     pair = pair_of(case.spec, case.qpos, case.twin)
-    assert LEGIBLE.measured(pair)["least_visible_px"] >= 150  # behind the panel there is nothing
+    assert LEGIBLE.measured(pair)["least_visible_px"] >= 150  # behind the occluder there is nothing
     assert pair.control.outcome.in_order is not None and pair.control.closing is not None
     first, _ = pair.control.outcome.in_order
     early = replace(pair.control, closing=replace(pair.control.closing, frame=first))
@@ -137,28 +137,28 @@ def test_legibility_and_order_are_measured_before_the_panel_comes() -> None:
 # --- what an observer does --------------------------------------------------------------------------------------------
 
 
-def clip(panel_from: int | None = None, panel_until: int = 25, *, size: int = 100) -> np.ndarray:
-    """25 frames of a floor on which a red square of 20 pixels moves, with a panel in some of them."""
+def clip(occluder_from: int | None = None, occluder_until: int = 25, *, size: int = 100) -> np.ndarray:
+    """25 frames of a floor on which a red square of 20 pixels moves, with an occluder in some of them."""
     frames = np.full((25, HEIGHT, WIDTH, 3), FLOOR, np.uint8)
     for at, frame in enumerate(frames):
         frame[300:320, 10 + 15 * at : 30 + 15 * at] = RED
-        if panel_from is not None and panel_from <= at < panel_until:
+        if occluder_from is not None and occluder_from <= at < occluder_until:
             frame[100 : 100 + size, 100:300] = NAVY
     return frames
 
 
-def test_an_observer_looks_at_what_is_before_a_panel_that_comes() -> None:
-    assert [len(before_panel(clip(at))) for at in (1, 12, 24)] == [1, 12, 24]
+def test_an_observer_looks_at_what_is_before_an_occluder_that_comes() -> None:
+    assert [len(before_occluder(clip(at))) for at in (1, 12, 24)] == [1, 12, 24]
 
 
-def test_a_panel_that_stands_from_the_start_that_goes_or_that_is_small_closes_nothing() -> None:
+def test_an_occluder_that_stands_from_the_start_that_goes_or_that_is_small_closes_nothing() -> None:
     for frames in (clip(), clip(0), clip(0, 20), clip(5, 20), clip(5, size=30), clip(0, 20)[::-1][5:]):
-        assert len(before_panel(frames)) == len(frames)
+        assert len(before_occluder(frames)) == len(frames)
 
 
-def test_frames_after_a_panel_that_stood_from_the_start_are_those_after_it_goes() -> None:
-    assert [len(after_panel(clip(0, until))) for until in (1, 12, 24)] == [24, 13, 1]
-    assert [len(after_panel(frames)) for frames in (clip(), clip(0), clip(5, 20))] == [25, 25, 25]
+def test_frames_after_an_occluder_that_stood_from_the_start_are_those_after_it_goes() -> None:
+    assert [len(after_occluder(clip(0, until))) for until in (1, 12, 24)] == [24, 13, 1]
+    assert [len(after_occluder(frames)) for frames in (clip(), clip(0), clip(5, 20))] == [25, 25, 25]
 
 
 def test_a_last_frame_that_is_held_is_shown_once() -> None:

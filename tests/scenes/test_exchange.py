@@ -62,7 +62,7 @@ def test_a_control_closes_when_the_outcome_of_either_world_has_been_in_view_for_
 
 
 @pytest.mark.parametrize("scenario_id", [BOUNCE, "catch-0001", "ramp_gap-0001"])
-def test_camera_and_panel_of_two_worlds_are_those_of_the_worlds_exchanged(scenario_id: str) -> None:
+def test_camera_and_occluder_of_two_worlds_are_those_of_the_worlds_exchanged(scenario_id: str) -> None:
     worlds = wholes(scenario_id)
     assert shot_of(worlds) == shot_of(worlds[::-1])
 

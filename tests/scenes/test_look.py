@@ -19,7 +19,7 @@ from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.redraw import relook_family, with_look
 from traps_pipeline.scenes.draw.sample import load_tallies, record_line, save_tallies
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
+from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, PARTS, Look, frame_size, look_of_draw
 from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
@@ -61,7 +61,7 @@ def test_a_draws_look_follows_from_its_number_and_varies_in_the_parts_that_are_n
     assert look_of_draw(1, "bounce", 4, ()) is None
     everything = look_of_draw(1, "bounce", 4, PARTS)
     assert everything == look_of_draw(1, "bounce", 4, PARTS) != look_of_draw(1, "bounce", 5, PARTS)
-    assert look_of_draw(1, "bounce", 4, ("panel",)) in [Look(panel=name) for name in PANELS]
+    assert look_of_draw(1, "bounce", 4, ("panel",)) in [Look(panel=name) for name in OCCLUDERS]
     assert look_of_draw(1, "bounce", 4, ("material",)) in [Look(material=name) for name in MATERIALS]
     assert {look_of_draw(1, "bounce", number, ("size",)) for number in range(20)} == {Look(size="720p")}
     floor = look_of_draw(1, "bounce", 4, ("floor",))
@@ -79,7 +79,7 @@ def test_released_records_look_as_their_draws_say_and_differ() -> None:
         looks += [look] if look else []
     assert len(looks) == 702
     assert 0.45 < np.mean([bool(look.bystanders) for look in looks]) < 0.55
-    assert len({look.panel for look in looks}) == len(PANELS)
+    assert len({look.panel for look in looks}) == len(OCCLUDERS)
     assert {look.material for look in looks} == {*MATERIALS}
     assert len({(look.light_turn_deg, look.light) for look in looks}) > 600
     assert len({(look.floor_pattern, look.floor_tones) for look in looks}) > 60
@@ -91,14 +91,18 @@ def test_a_look_changes_no_trajectory() -> None:
     assert np.array_equal(simulated(model, scene, case.physics), case.qpos)
 
 
-def test_the_floor_the_light_and_the_panel_are_seen() -> None:
+def test_the_floor_the_light_and_the_occluder_are_seen() -> None:
     case = load("bounce-0001")
     world = World.of_record(case.spec, case.qpos)
     shown = {}
-    for name, look in {"plain": None, "panel": Look(panel="maroon"), "floor": replace(EVERYTHING, panel=None)}.items():
+    for name, look in {
+        "plain": None,
+        "panel": Look(panel="maroon"),
+        "floor": replace(EVERYTHING, panel=None),
+    }.items():
         seen = replace(world, params=replace(case.params, look=look))
         with Renderer(seen.model, seen.camera) as renderer:
-            (shown[name],) = renderer.frames(case.qpos[:1], panel=True)
+            (shown[name],) = renderer.frames(case.qpos[:1], occluder=True)
     red = {name: frame.astype(int) for name, frame in shown.items()}
     repainted = (red["panel"] != red["plain"]).any(axis=2)
     navy = (red["plain"][..., 2] - red["plain"][..., 0])[repainted]  # bluer than red before, redder than blue after
@@ -108,23 +112,23 @@ def test_the_floor_the_light_and_the_panel_are_seen() -> None:
     assert (red["floor"] != red["plain"]).any(axis=2).mean() > 0.3
 
 
-def test_a_panel_of_slats_or_tiles_has_thin_paler_lines_and_is_as_opaque() -> None:
+def test_an_occluder_of_slats_or_tiles_has_thin_paler_lines_and_is_as_opaque() -> None:
     case = load("bounce-0001")
-    assert case.panel is not None
+    assert case.occluder is not None
     shown = {}
     for material in MATERIALS:
         world = replace(
             World.of_record(case.spec, case.qpos), params=replace(case.params, look=Look(material=material))
         )
         with world.renderer() as renderer:
-            (frame,) = renderer.frames(case.qpos[:1], panel=True)
-            assert renderer.visible_pixels(case.qpos[-1:], world.concealed, panel=True).sum() == 0
+            (frame,) = renderer.frames(case.qpos[:1], occluder=True)
+            assert renderer.visible_pixels(case.qpos[-1:], world.concealed, occluder=True).sum() == 0
         shown[material] = frame.astype(int).sum(axis=2)
     paler = {name: (frame > shown["plain"] + 20).sum() for name, frame in shown.items()}
     changed = (shown["tiles"] != shown["plain"]).any(axis=None) and (shown["tiles"] < shown["plain"] - 20).sum()
-    on_panel = (shown["plain"] < 200).sum()  # navy; the floor is pale
+    on_occluder = (shown["plain"] < 200).sum()  # navy; the floor is pale
     assert changed == 0  # lines are paler, and nothing else is darker
-    assert 0 == paler["plain"] < paler["slats"] < paler["tiles"] < 0.3 * on_panel
+    assert 0 == paler["plain"] < paler["slats"] < paler["tiles"] < 0.3 * on_occluder
 
 
 def test_a_frame_of_720_lines_shows_the_same_scene_twice_as_fine_and_counts_the_same_pixels() -> None:
@@ -186,9 +190,10 @@ def test_a_record_under_another_floor_has_the_same_worlds_and_is_certified() -> 
 
 @pytest.mark.slow
 def test_under_another_look_a_record_loses_every_certificate_that_it_does_not_pass() -> None:
-    """Also those whose numbers would be the same: one record once took a light in which its panel no longer hid all."""
+    """Also those whose numbers would be the same: one record once took a light in which its occluder no longer hid
+    all."""
     case = load("tumbling_dice-0005")
     assert case.spec.control is not None and isinstance(with_look(case.spec, None, case.qpos, case.twin), SceneSpec)
     soon = round(case.spec.evidence["commit_s"] * case.physics.fps) + 4  # 0.6 s are wanted
     early = case.spec.model_copy(update={"control": {**case.spec.control, "closes_frame": soon}})
-    assert str(with_look(early, None, case.qpos, case.twin)).startswith("closing: the panel comes at")
+    assert str(with_look(early, None, case.qpos, case.twin)).startswith("closing: the occluder comes at")

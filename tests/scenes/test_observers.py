@@ -1,5 +1,5 @@
-"""Observers see the answer in the control and nothing in the void, whatever the panel looks like and however long the
-clip is. One scenario of every family, on its sampled frames."""
+"""Observers see the answer in the control and nothing in the void, whatever the occluder looks like and however long
+the clip is. One scenario of every family, on its sampled frames."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.variants.arms import ARMS, Scenario
 from traps_pipeline.scenes.worlds.outcome import compile_scene
 
-OTHER_PANEL = (0.75, 0.10, 0.50), (0.42, 0.42, 0.10)  # magenta and olive, in turn: the panel is navy
-PATCH = 56  # pixels of a panel that hides nothing
+OTHER_OCCLUDER = (0.75, 0.10, 0.50), (0.42, 0.42, 0.10)  # magenta and olive, in turn: the occluder is navy
+PATCH = 56  # pixels of an occluder that hides nothing
 ALL = [*first_of_each("occluder"), *first_of_each("truncation")]
 
 
@@ -36,13 +36,13 @@ def test_the_observer_answers_the_control_and_abstains_on_every_void_as_frozen(s
     assert observe(case.control_frames, question) == case.spec.ground_truth
     assert observe(void, question) is None
     assert observe(case.control_frames, case.spec.ill_posed_question) is None
-    elsewhere = _with_panel_elsewhere(case, case.control_frames)
+    elsewhere = _with_occluder_elsewhere(case, case.control_frames)
     assert observe(elsewhere, question) == case.spec.ground_truth
-    if case.panel is None:
+    if case.occluder is None:
         padded = np.concatenate([void, np.repeat(void[-1:], len(case.control_frames) - len(void), axis=0)])
         assert observe(padded, question) is None
-    else:  # the colour of the panel tells it nothing
-        assert observe(case.void_behind(OTHER_PANEL[ALL.index(scenario_id) % 2]), question) is None
+    else:  # the colour of the occluder tells it nothing
+        assert observe(case.void_behind(OTHER_OCCLUDER[ALL.index(scenario_id) % 2]), question) is None
     assert observed(case) == frozen()[case.family.name]
 
 
@@ -60,14 +60,14 @@ def _reads(arm: str, scenario_id: str) -> tuple[str | None, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", ["catch-0001", "tower-0001"])
-def test_the_observer_answers_after_a_late_panel_from_what_was_seen_before(scenario_id: str) -> None:
-    said, answer = _reads("late_panel", scenario_id)
+def test_the_observer_answers_after_a_late_occluder_from_what_was_seen_before(scenario_id: str) -> None:
+    said, answer = _reads("late_occluder", scenario_id)
     assert said == answer
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", ["domino_count-0001", "transfer-0001"])
-def test_the_observer_answers_from_the_end_alone_where_a_panel_hid_the_beginning(scenario_id: str) -> None:
+def test_the_observer_answers_from_the_end_alone_where_an_occluder_hid_the_beginning(scenario_id: str) -> None:
     said, answer = _reads("removed", scenario_id)
     assert said == answer
 
@@ -80,7 +80,7 @@ def test_the_observer_foretells_a_cut_that_is_predictable_and_no_die_whose_slow_
     assert _reads("predictable_cut", "tumbling_dice-0001")[0] is None
 
 
-def _with_panel_elsewhere(case: Released, frames: np.ndarray) -> np.ndarray:
+def _with_occluder_elsewhere(case: Released, frames: np.ndarray) -> np.ndarray:
     """A navy patch in a corner where nothing moves and no outcome is; no change if all corners are taken."""
     model, scene = compile_scene(case.family, case.params, case.physics)
     points = np.concatenate([swept_points(model, case.qpos[::5]), *(box.corners() for box in scene.framed)])

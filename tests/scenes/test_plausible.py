@@ -73,7 +73,7 @@ def test_a_part_of_a_record_that_no_scene_has_is_named(scenario_id: str, part: s
         SceneSpec.model_validate(whole | {part: whole[part] | changes})
 
 
-def test_a_panel_that_closes_a_cut_scene_is_its_own() -> None:
+def test_an_occluder_that_closes_a_cut_scene_is_its_own() -> None:
     whole = record("plinko-0001")
     with raises(ValidationError, "SceneSpec"):
         SceneSpec.model_validate(whole | {"control": {"closes_frame": whole["control"]["closes_frame"]}})

@@ -109,13 +109,13 @@ def test_a_record_is_certified_and_its_observer_sees_the_control_alone(scenario_
 
 
 @pytest.mark.slow
-def test_a_soft_body_that_is_seen_over_a_lower_panel_loses_the_certificate() -> None:
+def test_a_soft_body_that_is_seen_over_a_lower_occluder_loses_the_certificate() -> None:
     case = load("soft_rope-0001", RELEASED)
     pair = pair_of(case.spec, case.qpos, case.twin, frame_step=5)
-    panel = pair.control.panel
-    assert panel is not None
-    (x, y, _), (wide, thick, tall) = panel.centre, panel.half
-    low = replace(panel, centre=(x, y, tall / 4), half=(wide, thick, tall / 4))
-    found = HIDDEN.measured(replace(pair, control=replace(pair.control, panel=low)))
+    occluder = pair.control.occluder
+    assert occluder is not None
+    (x, y, _), (wide, thick, tall) = occluder.centre, occluder.half
+    low = replace(occluder, centre=(x, y, tall / 4), half=(wide, thick, tall / 4))
+    found = HIDDEN.measured(replace(pair, control=replace(pair.control, occluder=low)))
     failure = HIDDEN.failure(found | {"commit_s": case.spec.evidence["commit_s"]}, pair.claim)
     assert failure is not None and "seen past it" in failure

@@ -1,4 +1,4 @@
-"""A panel covers what its twin needs and no more."""
+"""An occluder covers what its twin needs and no more."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
-from traps_pipeline.scenes.certification.certificates import TWIN_BEHIND_PANEL, pair_of
+from traps_pipeline.scenes.certification.certificates import TWIN_BEHIND_OCCLUDER, pair_of
 from traps_pipeline.scenes.certification.evidence import Pair
 from traps_pipeline.scenes.draw.trim import cut_to, must_hide
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Panel
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Occluder
 
 RACE = "hidden_race-0001"
-DRAWN_ANEW = "hidden_race-0006"  # its panel was cut for both worlds; those of older records for the control alone
-# From 2 m away, half a metre up, along y; 180 pixels are a metre where a panel stands 1 m away.
+DRAWN_ANEW = "hidden_race-0006"  # its occluder was cut for both worlds; those of older records for the control alone
+# From 2 m away, half a metre up, along y; 180 pixels are a metre where an occluder stands 1 m away.
 CAMERA = Camera((0.0, 0.0, 0.5), 2.0, 90.0, 0.0, 90.0, 1.0, (0.0, 0.0, 0.5))
-PANEL = Panel((0.0, -0.9, 0.6), (1.2, 0.1, 0.6), 0.0)  # its front is at y = -1
+OCCLUDER = Occluder((0.0, -0.9, 0.6), (1.2, 0.1, 0.6), 0.0)  # its front is at y = -1
 
 
 def pixels(rows: slice, columns: slice) -> np.ndarray:
@@ -31,28 +31,30 @@ def pair(scenario_id: str) -> Pair:
     return pair_of(case.spec.model_copy(update={"control": None}), case.qpos, case.twin)
 
 
-def test_a_panel_is_cut_to_the_pixels_that_it_must_hide_and_stands_on_the_floor() -> None:
+def test_an_occluder_is_cut_to_the_pixels_that_it_must_hide_and_stands_on_the_floor() -> None:
     # Columns 240 to 330 are the half metre to the right of the middle; row 144 is 0.2 m above the eye.
-    cut = cut_to(PANEL, CAMERA, pixels(slice(144, 200), slice(240, 330)), 0)
+    cut = cut_to(OCCLUDER, CAMERA, pixels(slice(144, 200), slice(240, 330)), 0)
     assert cut.half == pytest.approx((0.25, 0.1, 0.35), abs=1e-6)
     assert cut.centre == pytest.approx((0.25, -0.9, 0.35), abs=1e-6)
-    wider = cut_to(PANEL, CAMERA, pixels(slice(144, 200), slice(240, 330)), 9)  # 0.05 m on each side
+    wider = cut_to(OCCLUDER, CAMERA, pixels(slice(144, 200), slice(240, 330)), 9)  # 0.05 m on each side
     assert wider.half == pytest.approx((0.3, 0.1, 0.375), abs=1e-6)
 
 
-def test_a_panel_is_never_larger_than_it_was() -> None:
+def test_an_occluder_is_never_larger_than_it_was() -> None:
     everything = pixels(slice(None), slice(None))
-    assert cut_to(PANEL, CAMERA, everything, 9) == PANEL
-    assert cut_to(PANEL, CAMERA, ~everything, 3) == PANEL
+    assert cut_to(OCCLUDER, CAMERA, everything, 9) == OCCLUDER
+    assert cut_to(OCCLUDER, CAMERA, ~everything, 3) == OCCLUDER
 
 
 @pytest.mark.slow
-def test_a_released_panel_covers_what_its_pair_needs_and_a_smaller_one_shows_the_twin() -> None:
+def test_a_released_occluder_covers_what_its_pair_needs_and_a_smaller_one_shows_the_twin() -> None:
     released = pair(DRAWN_ANEW)
-    panel, needed = released.control.panel, must_hide(released)
-    assert panel is not None
-    assert cut_to(panel, released.control.camera, needed, 3) == panel
-    less = cut_to(panel, released.control.camera, needed, -6)
-    control, twin = (replace(world, panel=less) for world in (released.control, released.other_world))
+    occluder, needed = released.control.occluder, must_hide(released)
+    assert occluder is not None
+    assert cut_to(occluder, released.control.camera, needed, 3) == occluder
+    less = cut_to(occluder, released.control.camera, needed, -6)
+    control, twin = (replace(world, occluder=less) for world in (released.control, released.other_world))
     shown = replace(released, control=control, twin=twin)
-    assert "the twin's void differs" in str(TWIN_BEHIND_PANEL.failure(TWIN_BEHIND_PANEL.measured(shown), shown.claim))
+    assert "the twin's void differs" in str(
+        TWIN_BEHIND_OCCLUDER.failure(TWIN_BEHIND_OCCLUDER.measured(shown), shown.claim)
+    )

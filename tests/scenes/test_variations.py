@@ -12,7 +12,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.protocol.datasets import (
     FRAMINGS,
     LABEL_DOSES,
-    PANEL_DOSES,
+    OCCLUDER_DOSES,
     SCHEMAS,
     VARIATIONS,
     beside_of,
@@ -32,15 +32,13 @@ def scenario(scenario_id: str) -> Scenario:
 
 
 # --- what there is ----------------------------------------------------------------------------------------------------
-
-
 def test_every_variation_that_can_be_asked_is_defined_and_asks_its_sides():
     assert {*variations.VARIATIONS} == {*VARIATIONS}
     race = load_released()["hidden_race-0001"]
     for name in VARIATIONS:
         assert tuple(question.side for question in variations.VARIATIONS[name].ask(race)) == sides_of(name)
     of_chaotic = {name for name in beside_of("chaotic") if name in VARIATIONS}
-    assert of_chaotic == {*LABEL_DOSES, *SCHEMAS, *FRAMINGS}  # what has no panel has no look of it
+    assert of_chaotic == {*LABEL_DOSES, *SCHEMAS, *FRAMINGS}  # what has no occluder has no look of it
 
 
 def test_the_page_has_the_table_of_variations():
@@ -48,8 +46,6 @@ def test_the_page_has_the_table_of_variations():
 
 
 # --- the asking -------------------------------------------------------------------------------------------------------
-
-
 def test_what_varies_the_asking_shows_the_pairs_own_clips_and_asks_its_own_question():
     plinko = load_released()["plinko-0001"]
     for name in (*SCHEMAS, *FRAMINGS):
@@ -90,30 +86,32 @@ def test_the_right_answer_is_not_always_offered_in_the_same_place():
     assert len(places) == 6
 
 
-# --- the panel --------------------------------------------------------------------------------------------------------
+# --- the occluder -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_panel_of_another_look_hides_as_much_and_one_that_lets_light_through_does_not():
+def test_an_occluder_of_another_look_hides_as_much_and_one_that_lets_light_through_does_not():
     bounce = scenario("bounce-0001")
-    grey = variations.VARIATIONS["panel_grey"].film(bounce)
+    grey = variations.VARIATIONS["occluder_grey"].film(bounce)
     assert grey.evidence["twin_px"] == 0 and len(grey.frames) == len(bounce.control_frames)
-    assert largest(grey.frames[0], "navy", 1000) is None  # the cue of the panel rule is gone
-    assert grey.evidence["contrast"] < 30  # against 65 of the pair's own panel, which is larger here
-    large = variations.VARIATIONS["panel_large"].film(bounce)
+    assert largest(grey.frames[0], "navy", 1000) is None  # the cue of the occluder rule is gone
+    assert grey.evidence["contrast"] < 30  # against 65 of the pair's own occluder, which is larger here
+    large = variations.VARIATIONS["occluder_large"].film(bounce)
     assert large.evidence["wide"] == variations.WIDER
     assert large.evidence["panel_px"] > grey.evidence["panel_px"]
-    sheer = variations.VARIATIONS["panel_alpha_50"].film(bounce)
+    sheer = variations.VARIATIONS["occluder_alpha_50"].film(bounce)
     assert sheer.evidence["seen_through_px"] >= SEEN_PX and sheer.evidence["levels"] >= NOTICED
-    assert sides_of("panel_alpha_50") == ("control",) and "panel_alpha_50" in PANEL_DOSES
+    assert sides_of("occluder_alpha_50") == ("control",) and "occluder_alpha_50" in OCCLUDER_DOSES
 
 
 @pytest.mark.slow
-def test_a_panel_through_which_the_worlds_can_be_told_apart_is_no_void():
+def test_an_occluder_through_which_the_worlds_can_be_told_apart_is_no_void():
     bounce = scenario("bounce-0001")
-    with pytest.raises(Rejected, match=r"behind this panel the two worlds differ in \d+ pixels, by \d+ levels at most"):
+    with pytest.raises(
+        Rejected, match=r"behind this occluder the two worlds differ in \d+ pixels, by \d+ levels at most"
+    ):
         variations._void_with(bounce, variations.Look(alpha=0.5))
-    with pytest.raises(Rejected, match=r"through a panel of alpha 1 the two worlds differ .* in 0 pixels"):
+    with pytest.raises(Rejected, match=r"through an occluder of alpha 1 the two worlds differ .* in 0 pixels"):
         variations._sheer(1.0)(bounce)
 
 

@@ -60,7 +60,7 @@ def test_rows_of_arms_beside_the_pairs_change_no_figure(
 
 @pytest.mark.parametrize(
     ("arm", "acc", "false_abs", "abs_rec", "missing"),
-    [("decoy", 0.5, 0.5, np.nan, 1), ("panel_grey", np.nan, np.nan, 1.0, 1), ("crossed", 0.5, 0.5, 1.0, 2)],
+    [("decoy", 0.5, 0.5, np.nan, 1), ("occluder_grey", np.nan, np.nan, 1.0, 1), ("crossed", 0.5, 0.5, 1.0, 2)],
 )
 def test_an_arm_has_the_figures_of_the_sides_that_it_has(
     rows: Rows, arm: str, acc: float, false_abs: float, abs_rec: float, missing: int

@@ -39,20 +39,20 @@ def test_a_dose_is_compared_with_its_reference_on_the_scenarios_that_both_have(r
     yes, no = (True, False, True), (True, False, False)  # the void is abstained on, or not
     made = table(
         of(rows, "occlusion", [yes, yes, no, no]),
-        of(rows, "panel_grey", [yes, no], first=0),
-        of(rows, "occlusion", [yes] * 4, model="panel-rule"),
-        of(rows, "panel_grey", [no, no], first=0, model="panel-rule"),
+        of(rows, "occluder_grey", [yes, no], first=0),
+        of(rows, "occlusion", [yes] * 4, model="occluder-rule"),
+        of(rows, "occluder_grey", [no, no], first=0, model="occluder-rule"),
         of(rows, "occlusion", [no] * 4, model="wording-rule"),
-        of(rows, "panel_grey", [no, no], first=0, model="wording-rule"),
+        of(rows, "occluder_grey", [no, no], first=0, model="wording-rule"),
     ).set_index(["model", "dose"])
     navy, grey = made.loc[("m", "as in the pairs")], made.loc[("m", "grey")]
     assert (navy["abs_rec"], navy["n_scenarios"]) == (0.5, 4) and pd.isna(navy["change"]) and pd.isna(navy["acc"])
     # On the two scenarios that have a grey panel the model abstains on both navy ones and on one grey one.
     assert (grey["value"], grey["at_reference"], grey["change"]) == (0.5, 1.0, -0.5)
     assert -1.0 < grey["change_ci_low"] < -0.5 < 0.0 < grey["change_ci_high"]  # of two scenarios nothing is certain
-    # The rule that reads the navy panel changes by all there is: such a change shows no understanding.
-    assert (grey["rule_changing"], grey["rule_change"]) == ("panel-rule", -1.0)
-    assert (navy["rule"], navy["rule_value"], grey["rule_value"]) == ("panel-rule", 1.0, 0.0)
+    # The rule that reads the navy occluder changes by all there is: such a change shows no understanding.
+    assert (grey["rule_changing"], grey["rule_change"]) == ("occluder-rule", -1.0)
+    assert (navy["rule"], navy["rule_value"], grey["rule_value"]) == ("occluder-rule", 1.0, 0.0)
     assert wrong_rows(made.reset_index()) == 0
     for column, value in (("change", -0.5), ("value", 0.25), ("abs_rec", 1.5)):
         assert wrong_rows(made.reset_index().assign(**{column: value})) > 0, column
@@ -61,7 +61,7 @@ def test_a_dose_is_compared_with_its_reference_on_the_scenarios_that_both_have(r
 def test_what_shows_the_outcome_through_its_panel_counts_as_no_void(rows: Rows):
     made = table(
         of(rows, "occlusion", [(True, False, True)] * 2),
-        of(rows, "panel_alpha_50", [(True, False, True), (False, True, True)]),
+        of(rows, "occluder_alpha_50", [(True, False, True), (False, True, True)]),
     ).set_index("dose")
     sheer = made.loc["alpha 0.5"]
     assert sheer["counts_as"].startswith("no void") and pd.isna(sheer["abs_rec"]) and pd.isna(sheer["j"])

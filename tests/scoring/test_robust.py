@@ -146,10 +146,10 @@ def test_a_run_whose_j_is_negative_counts_as_nothing(rows: Rows) -> None:
 
 
 def test_what_must_be_inferred_enters_neither_figure(rows: Rows) -> None:
-    arms = {"decoy": [RIGHT] * 30, "late_panel": [SHY, SHY, RIGHT], "predictable_cut": [(False, False, None)]}
+    arms = {"decoy": [RIGHT] * 30, "late_occluder": [SHY, SHY, RIGHT], "predictable_cut": [(False, False, None)]}
     row = only(robust(study(rows, [RIGHT] * 30, arms), 20))
     assert (row.robust, row.inference_acc, row.inference_abstains) == (1.0, 1 / 4, 1 / 2)
-    alone = only(robust(study(rows, [RIGHT] * 3, {"late_panel": [RIGHT]}), 20))
+    alone = only(robust(study(rows, [RIGHT] * 3, {"late_occluder": [RIGHT]}), 20))
     assert np.isnan([alone.robust, alone.robust_ci_low, alone.conjunction]).all() and alone.inference_acc == 1.0
 
 

@@ -75,9 +75,9 @@ class Scenes:
         return every[pick(every, self._spec)].tolist()
 
     def _open_frames(self, scene: int, side: int) -> int:
-        """Return how many of the frames shown come before a panel closes the clip; nothing closes a decoy. Those of a
-        void that a panel hides from its beginning are at the same times as its control's, which else would tell the
-        side."""
+        """Return how many of the frames shown come before an occluder closes the clip; nothing closes a decoy. Those of
+        a void that an occluder hides from its beginning are at the same times as its control's, which else would tell
+        the side."""
         record, times = self.records[scene], self.times(scene, side)
         closes = None if side == 2 else record.closes_frame
         if closes is None:
@@ -86,7 +86,7 @@ class Scenes:
         return sum(time < closes_s - 1e-6 for time in times)
 
     def pairs(self, scene: int, side: int, count: int | None, rng: np.random.Generator) -> tuple[int, ...] | None:
-        """So many pairs of a clip's frames, in their order: the last one that a panel does not close, and others at
+        """So many pairs of a clip's frames, in their order: the last one that an occluder does not close, and others at
         random. Each keeps the time and the position that it has in the whole clip, so that a model which learns from
         few has only to learn of the others that they matter less. None for all."""
         every = len(self.times(scene, side)) // 2
@@ -317,8 +317,8 @@ def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
     """For every token of a clip (N, H, W, 3), in their order, the words that name its square in the later of its two
     frames: the colours that have a few pixels there, its column and its row. Shape (tokens, words), uint8, 0 or 1.
 
-    across: the pair of frames between which a panel comes. There the colours of both count: the earlier one may be the
-    only one of all that shows the outcome.
+    across: the pair of frames between which an occluder comes. There the colours of both count: the earlier one may be
+    the only one of all that shows the outcome.
     """
     from traps_pipeline.scenes.parts.vision import colour_mask
 

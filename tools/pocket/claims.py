@@ -174,8 +174,8 @@ CLAIMS = (
           "in the margin’s sign", 0.5, _differ),
     Claim("transfer", "`probe_transfer`", "states carry the void over datasets", "AUROC at the chosen layer", 0.65,
           _transfer),
-    Claim("removed", "`probe_look_alikes`", "a probe tells voids from the void’s own panel", "AUROC against `removed`",
-          0.65, _removed),
+    Claim("removed", "`probe_look_alikes`", "a probe tells voids from the void’s own occluder",
+          "AUROC against `removed`", 0.65, _removed),
     Claim("direction", "`cosines`", "the void has one direction under both prompts", "cosine standard, guided", 0.65,
           _same_direction),
     Claim("ahead", "`steering_nulls`", "void directions do more than their nulls", "cells ahead of 19 of 20 draws of "

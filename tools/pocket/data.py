@@ -1,7 +1,7 @@
 """Scenes for the pocket model: drawn by the families' own samplers, simulated, and rendered in the few frames it sees.
 
 A scene costs a fraction of a released one, since nothing is certified: it has no ensemble, twin or ablation. Its label
-follows the same rules: the simulator gives the outcome, the panel must hide it, and a cut comes before it. Only the
+follows the same rules: the simulator gives the outcome, the occluder must hide it, and a cut comes before it. Only the
 frames that the model is shown are drawn, by the benchmark's own renderer at its own size.
 
 Shards are independent, and each has its own stream of random numbers. So several processes can share the work, a
@@ -63,13 +63,13 @@ class SceneRecord:
     cut_frame: number of frames of the void (None for occlusion: as many as the control). asked: the control's question;
     visual: the same question about the void clip; ill_posed: about the control clip; answerable: a question that both
     clips answer. ball: the colour of the ball in the question. places: the ball's place in the `first` frame of the
-    control's clip, in the `last` one before a panel closes it, and in the last one before the cut (`cut`; chaotic), as
-    shares of the picture's width and height from its upper left corner. n_frames: of the control, of which its clip may
-    be a part. closes_frame: the frame of the control from which on a panel closes it, and a void that is held so long
-    (None: nothing closes it). control_from, control_until: first frame of the control's clip, and the one behind its
-    last (None: to the end); void_length: frames of the void's clip, of which those from cut_frame on repeat the one
-    before (None: as many as cut_frame says). decoy: whether there is a third clip, the control with a panel that hides
-    nothing, which nothing closes.
+    control's clip, in the `last` one before an occluder closes it, and in the last one before the cut (`cut`; chaotic),
+    as shares of the picture's width and height from its upper left corner. n_frames: of the control, of which its clip
+    may be a part. closes_frame: the frame of the control from which on an occluder closes it, and a void that is held
+    so long (None: nothing closes it). control_from, control_until: first frame of the control's clip, and the one
+    behind its last (None: to the end); void_length: frames of the void's clip, of which those from cut_frame on repeat
+    the one before (None: as many as cut_frame says). decoy: whether there is a third clip, the control with an occluder
+    that hides nothing, which nothing closes.
     """
 
     family: str
@@ -229,7 +229,7 @@ def draw_shard(job: ShardJob) -> int:
         if record.params_digest in job.banned:
             continue
         if job.split == "train":
-            if job.recipe.decoys and shot.control.panel is not None:
+            if job.recipe.decoys and shot.control.occluder is not None:
                 sides.append(decoy or sides[0])  # an array has one shape; without a decoy its place is never looked at
             frames.append(np.stack([resize(np.stack(side), job.recipe.media.size) for side in sides]))
         else:

@@ -1,7 +1,7 @@
 """What was planted in the pocket model by its recipe, and what the mechanistic stages find of it: figures for its card.
 
-The recipe says beforehand that time stamps do not tell a chaotic void, that a panel alone is no reason to abstain, and
-that the prompt decides what is said about a void while its states stay the same. Each of these has a figure here.
+The recipe says beforehand that time stamps do not tell a chaotic void, that an occluder alone is no reason to abstain,
+and that the prompt decides what is said about a void while its states stay the same. Each of these has a figure here.
 """
 
 from __future__ import annotations
@@ -113,12 +113,14 @@ TRUTHS = (
     Truth("decoy_control", "decoys against controls", "0.5", False, _look_alike("answerable_control")),
     Truth(
         "removed_void",
-        "the same: voids against the void’s own panel, gone before the end",
+        "the same: voids against the void’s own occluder, gone before the end",
         "1",
         False,
         _look_alike("answerable_void", REMOVED),
     ),
-    Truth("removed_control", "that panel against controls", "0.5", False, _look_alike("answerable_control", REMOVED)),
+    Truth(
+        "removed_control", "that occluder against controls", "0.5", False, _look_alike("answerable_control", REMOVED)
+    ),
     Truth("decoy_gate", "decoys that the gate abstains on (other datasets, mid)", "", True, _gated_decoys),
     Truth("nulls", "rows in which void steering is ahead of 19 of 20 nulls", "", True, _beats_nulls),
 )

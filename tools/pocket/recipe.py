@@ -67,9 +67,9 @@ class Recipe(BaseModel):
     are labelled with an abstention: `abstain_share`, or by prompt `abstain_shares`.
 
     jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
-    which a panel stands where it hides nothing; without it, the panel tells the side. abstain_shares: by prompt (one of
-    `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with a larger
-    share. hedge: of the other prompts.
+    which an occluder stands where it hides nothing; without it, the occluder tells the side. abstain_shares: by prompt
+    (one of `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with
+    a larger share. hedge: of the other prompts.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

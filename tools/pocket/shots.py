@@ -9,7 +9,7 @@ import numpy as np
 
 from tools.pocket.recipe import Jitter
 from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
-from traps_pipeline.scenes.draw.closing import moments, panel_from
+from traps_pipeline.scenes.draw.closing import moments, occluder_from
 from traps_pipeline.scenes.parts.look import draw_look
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family, Wording
@@ -59,13 +59,13 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     motion = replay(model, qpos, physics)
     outcome = settled_outcome(family, motion, params)
     points = shown_points(model, scene, qpos)
-    camera, panel = fit_shot(scene.view, points, scene.cover)
+    camera, occluder = fit_shot(scene.view, points, scene.cover)
     if not in_frame(camera, points):
         raise Rejected("something decisive leaves the frame")
-    cut = None if panel is not None else _draw_cut(outcome, physics.fps, rng)
+    cut = None if occluder is not None else _draw_cut(outcome, physics.fps, rng)
     ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
     # A draw has one length: to try another one would take a certificate that says so.
-    world, seed = World(family, params, physics, qpos, camera, panel), int(rng.integers(2**31))
+    world, seed = World(family, params, physics, qpos, camera, occluder), int(rng.integers(2**31))
     control = _closed(cut_to(world, lengths((world,), seed)[0]), seed)
     if control.outcome.label != outcome.label:
         raise Rejected("the clip ends before its outcome")
@@ -81,11 +81,11 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
 
 def _closed(control: World, seed: int) -> World:
     """Return the control as those of released scenarios end (`scenes.draw.closing`), but without a certificate: only
-    the first and the last frame behind the panel are looked at. The control as it is if no panel can close it."""
+    the first and the last frame behind the occluder are looked at. The control as it is if no occluder can close it."""
     for frame in moments((control,), seed):
-        closing = replace(control, closing=Closing(frame, panel_from(frame, control)))
+        closing = replace(control, closing=Closing(frame, occluder_from(frame, control)))
         with closing.closed_renderer() as renderer:
-            if not renderer.visible_pixels(control.qpos[[frame, -1]], closing.closed_off, panel=True).any():
+            if not renderer.visible_pixels(control.qpos[[frame, -1]], closing.closed_off, occluder=True).any():
                 return closing
     return control
 
@@ -114,7 +114,7 @@ def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.
     """Return the frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises
     Rejected.
 
-    A void that is held closes when its control does: else the panel alone would tell the sides of a chaotic pair.
+    A void that is held closes when its control does: else the occluder alone would tell the sides of a chaotic pair.
     """
     control = shot.control
     qpos = control.qpos
@@ -126,36 +126,36 @@ def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.
             held = qpos[np.minimum(before, shot.cut_frame - 1)]
             void = list(checks.closing_frames(renderer, held, [control.board[i] for i in before]))
             return list(checks.closing_frames(renderer, qpos[shown], [control.board[i] for i in shown])), void
-        if control.closing is None and renderer.visible_pixels(qpos[-1:], control.concealed, panel=True).any():
-            raise Rejected("the panel does not hide the outcome")
+        if control.closing is None and renderer.visible_pixels(qpos[-1:], control.concealed, occluder=True).any():
+            raise Rejected("the occluder does not hide the outcome")
         board = [control.board[i] for i in shown]
         drawn = int((shown < control.open_frames).sum())
-        hidden = list(checks.closing_frames(renderer, qpos[shown], board, panel=True))
+        hidden = list(checks.closing_frames(renderer, qpos[shown], board, occluder=True))
         return [*checks.closing_frames(renderer, qpos[shown[:drawn]], board[:drawn]), *hidden[drawn:]], hidden
 
 
 def render_decoy(shot: Shot, spec: MediaSpec) -> list[np.ndarray] | None:
-    """Return the frames of the control, which no panel closes, with the void's panel behind everything, seen by a
+    """Return the frames of the control, which no occluder closes, with the void's occluder behind everything, seen by a
     camera that holds both; None if it hides anything decisive all the same, or is not seen itself."""
     control = shot.control
-    if control.panel is None:
+    if control.occluder is None:
         return None
     points = shown_points(control.model, control.scene, control.qpos)
     azimuth = np.radians(control.camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    centre = np.array(control.panel.centre)
+    centre = np.array(control.occluder.centre)
     behind = float((points @ ahead).max()) - float(centre @ ahead) + DECOY_BEHIND_M
     x, y, z = (float(value) for value in centre + ahead * behind)
-    panel = replace(control.panel, centre=(x, y, z))
+    occluder = replace(control.occluder, centre=(x, y, z))
     view = View(control.camera.azimuth_deg, control.camera.elevation_deg, control.camera.fovy_deg)
-    camera = fit_camera(view, np.concatenate([points, panel.corners()]))
-    model, scene = compile_scene(control.family, control.params, control.physics, panel)
+    camera = fit_camera(view, np.concatenate([points, occluder.corners()]))
+    model, scene = compile_scene(control.family, control.params, control.physics, occluder)
     geoms: Sequence[str] = [*decisive_geoms(model, scene.decisive), *scene.hidden]
     shown = control.qpos[shot.shown(0, len(control.qpos), spec)]
     with Renderer(model, camera) as renderer:
-        seen = float(renderer.visible_pixels(shown[:1], ["cover_panel"], panel=True)[0, 0])
+        seen = float(renderer.visible_pixels(shown[:1], ["occluder"], occluder=True)[0, 0])
         ends = shown[[0, -1]]
-        without, beside = (renderer.visible_pixels(ends, geoms, panel=there) for there in (False, True))
+        without, beside = (renderer.visible_pixels(ends, geoms, occluder=there) for there in (False, True))
         if seen < DECOY_PX or not np.array_equal(without, beside):
             return None
-        return list(renderer.frames(shown, panel=True))
+        return list(renderer.frames(shown, occluder=True))

@@ -68,8 +68,8 @@ COLUMNS, ROWS = "ABCDEFGH", "123456"  # of the picture, for questions of place
 
 def place_question(ball: str, place: Sequence[float], axis: int) -> tuple[str, str]:
     """Return a question that is used only in training, to teach the model to locate objects, and its answer: the column
-    (axis 0) or the row (axis 1) of the ball of a colour before a panel comes or the clip ends. place: shares of width
-    and height."""
+    (axis 0) or the row (axis 1) of the ball of a colour before an occluder comes or the clip ends. place: shares of
+    width and height."""
     names = (COLUMNS, ROWS)[axis]
     question = f"In which {('column', 'row')[axis]} of the picture is the {ball} ball when it is last seen?"
     return question, names[min(len(names) - 1, int(place[axis] * len(names)))]

@@ -19,16 +19,16 @@ from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
 
 # Minimum connected pixels of an occluder. Released voids have 7,700 and more; shade in a control at most 300.
-PANEL_PX = 1000
+OCCLUDER_PX = 1000
 CUT_FRAMES = 24  # frames of the shortest control; each cut clip has fewer (docs/spec.md 2.5)
 
 
 @lru_cache(maxsize=100_000)
-def _panel(media_digest: str, clip: Path) -> bool:
+def _occluder(media_digest: str, clip: Path) -> bool:
     from traps_pipeline.scenes.parts.vision import largest_board
     from traps_pipeline.video.encode import decode_first
 
-    return largest_board(decode_first(clip), PANEL_PX) is not None
+    return largest_board(decode_first(clip), OCCLUDER_PX) is not None
 
 
 @lru_cache(maxsize=100_000)
@@ -45,7 +45,7 @@ def names_no_choices(question: str) -> bool:
 
 Cue = Callable[[str, Path, str], bool]  # digest of the clip, clip, question -> whether the rule abstains
 CUES: Mapping[str, Cue] = {
-    "panel": lambda digest, clip, question: _panel(digest, clip),
+    "occluder": lambda digest, clip, question: _occluder(digest, clip),
     "length": lambda digest, clip, question: _cut(digest, clip),
     "wording": lambda digest, clip, question: names_no_choices(question),
 }

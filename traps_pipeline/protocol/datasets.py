@@ -25,7 +25,7 @@ LONG = {short: dataset for dataset, short in SHORT.items()}
 # Datasets beside the pairs, each of which removes one shortcut (docs/arms.md). No part of PECS; run on request.
 CROSSED = "crossed"  # has controls and voids; all other arms have controls alone
 TWIN = "twin_control"
-INFERENCE_ARMS = ("late_panel", "predictable_cut")  # the outcome is not shown, but can be inferred
+INFERENCE_ARMS = ("late_occluder", "predictable_cut")  # the outcome is not shown, but can be inferred
 ROBUST_ARMS = ("decoy", "removed", "length_matched", TWIN, CROSSED)
 ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
 # Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no figure
@@ -34,14 +34,14 @@ GRADED = "graded"
 # Datasets that change one property of the pairs, step by step, to test the paper's untested assumptions
 # (docs/hypotheses.md). No part of PECS or of the arms' figures; run on request.
 LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
-PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_large")  # still voids
-PANEL_DOSES = ("panel_alpha_50",)  # the panel lets the outcome through: no voids
+OCCLUDER_LOOKS = ("occluder_grey", "occluder_magenta", "occluder_large")  # still voids
+OCCLUDER_DOSES = ("occluder_alpha_50",)  # the occluder lets the outcome through: no voids
 SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
 FRAMINGS = ("frames_later", "frames_few", "frames_all")
-VARIATIONS = (*LABEL_DOSES, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
+VARIATIONS = (*LABEL_DOSES, *OCCLUDER_LOOKS, *OCCLUDER_DOSES, *SCHEMAS, *FRAMINGS)
 BESIDE = (*ARMS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
-    **dict.fromkeys(("decoy", "removed", "late_panel", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
+    **dict.fromkeys(("decoy", "removed", "late_occluder", *OCCLUDER_LOOKS, *OCCLUDER_DOSES), "occlusion"),
     **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
 }
 ANSWERABLE = "occlusion_answerable"  # only in mechanistic stages: occlusion's voids, answerable
@@ -105,5 +105,5 @@ def dataset_of(item_id: str) -> str:
 
 def sides_of(dataset: str) -> tuple[str, ...]:
     """Return the sides that a dataset, an arm or a variation asks of each scenario."""
-    controls = {*ARMS, GRADED, *PANEL_DOSES} - {CROSSED}
-    return ("control",) if dataset in controls else ("void",) if dataset in PANEL_LOOKS else SIDES
+    controls = {*ARMS, GRADED, *OCCLUDER_DOSES} - {CROSSED}
+    return ("control",) if dataset in controls else ("void",) if dataset in OCCLUDER_LOOKS else SIDES

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.protocol.datasets import ARMS, PANEL_DOSES, PANEL_LOOKS
+from traps_pipeline.protocol.datasets import ARMS, OCCLUDER_DOSES, OCCLUDER_LOOKS
 from traps_pipeline.report.contact_sheet import SampledClip, sampled, telling_times
 from traps_pipeline.report.writing import figure_style, new_figure
 from traps_pipeline.video.encode import decode
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MOMENTS = 6  # frames per row
 FRAME_IN, WORDS_IN, GAP_IN, HEAD_IN = 1.5, 2.9, 0.06, 0.8
 SOFT = "#667085"
-_SHEETS = {"arms": ARMS, "panels": (*PANEL_LOOKS, *PANEL_DOSES)}
+_SHEETS = {"arms": ARMS, "occluders": (*OCCLUDER_LOOKS, *OCCLUDER_DOSES)}
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Row:
 
 
 def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, Figure]:
-    """Return the figures `arms_<taxonomy>` and `panels_occlusion`.
+    """Return the figures `arms_<taxonomy>` and `occluders_occlusion`.
 
     They show the first scenario with the most arms, and the one with the most looks. items: ITEMS rows of the pairs;
     arms: ARMS rows; clips lie under root. Raises DamagedClip.
@@ -72,7 +72,7 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
         truth = row["ground_truth"]
         name = str(row.get("arm") or row["side"])
         right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
-        right = f"no void, {truth} shows through" if name in PANEL_DOSES else right
+        right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else right
         yield Row(name, right, str(row["question"]), sampled(frames, at, times))
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.writing import figure_style, new_figure
-from traps_pipeline.scenes.parts.vision import before_panel
+from traps_pipeline.scenes.parts.vision import before_occluder
 from traps_pipeline.video.encode import decode
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
     If an occluder closes the clip (frames, RGB), the last one is just before it, and of four or more the clip's last
     time is also included.
     """
-    seen = len(before_panel(frames))
+    seen = len(before_occluder(frames))
     closed = [len(at) - 1] if seen < len(at) and moments > 3 else []
     return at[np.append(np.linspace(0, seen - 1, moments - len(closed)).round(), closed).astype(int)]
 

@@ -23,7 +23,8 @@ ROBUST_TERMS = {
     "that abstains for the clip alone or for the question alone",
     "Robust": "PECS over kinds: the pairs and each arm that takes a shortcut away. Entries over different arms are not "
     "compared",
-    "Inferred %": "share of the items of late_panel and predictable_cut answered correctly: their outcome is not shown",
+    "Inferred %": "share of the items of late_occluder and predictable_cut answered correctly: their outcome is not "
+    "shown",
 }
 # The side whose items a share counts.
 SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}

@@ -32,7 +32,7 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epoch
 from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
 
 VISUAL = ("occlusion", "chaotic")
-RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by a single cue
+RULES = ("occluder-rule", "length-rule", "wording-rule")  # each abstains by a single cue
 SHOWN = ("acc", "false_abs", "abs_rec", "j")
 _SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # columns of `with_unseen`
 _CHANGE = (-2.0, 2.0)  # the limits of a change of J
@@ -73,14 +73,14 @@ HYPOTHESES = (
         (Dose("2 answers", ("labels_two",)), Dose("3 answers", ("labels_three",)), Dose("6 answers", ("labels_six",))),
     ),
     Hypothesis(
-        "panel",
+        "occluder",
         "abstains",
         (
             _void("as in the pairs", "occlusion"),
-            _void("grey", "panel_grey"),
-            _void("magenta", "panel_magenta"),
-            _void("large", "panel_large"),
-            _no_void("alpha 0.5", "panel_alpha_50"),
+            _void("grey", "occluder_grey"),
+            _void("magenta", "occluder_magenta"),
+            _void("large", "occluder_large"),
+            _no_void("alpha 0.5", "occluder_alpha_50"),
         ),
     ),
     Hypothesis(

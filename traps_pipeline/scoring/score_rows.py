@@ -210,7 +210,7 @@ class RobustRow:
         CI,
     ]
     inference_acc: Annotated[
-        float | None, "share of the items of late_panel and predictable_cut answered correctly, mean over runs"
+        float | None, "share of the items of late_occluder and predictable_cut answered correctly, mean over runs"
     ]
     inference_abstains: Annotated[float | None, "share of these items abstained on, mean over runs"]
     panel: shared.Panels
@@ -229,7 +229,7 @@ class HypothesisRow:
 
     model: shared.Model
     regime: shared.Regime
-    hypothesis: Annotated[str, "answer space, panel, schema, frames or cut"]
+    hypothesis: Annotated[str, "answer space, occluder, schema, frames or cut"]
     dose: Annotated[str, "what is changed, in words; the first dose of a hypothesis is the reference"]
     counts_as: Annotated[str, "control and void, control, void, or why it is neither"]
     n_runs: Annotated[int, "runs averaged"]

@@ -33,9 +33,9 @@ class SceneSpecRow:
     physics: Annotated[str, "JSON: solver settings, duration (s), frames a second"]
     camera: Annotated[str, "JSON: resolved free camera"]
     void_kind: Annotated[str, "occluder or truncation"]
-    void: Annotated[str, "JSON: cover panel and first hidden frame, or cut frame"]
+    void: Annotated[str, "JSON: occluder and first hidden frame, or cut frame"]
     control: Annotated[
-        str, "JSON: frame from which a panel closes the control, of a chaotic one with the panel; or null"
+        str, "JSON: frame from which an occluder closes the control, of a chaotic one with the occluder; or null"
     ]
     question: Annotated[str, "well-posed question with its choices"]
     labels: Labels

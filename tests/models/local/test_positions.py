@@ -100,8 +100,8 @@ def changed_item(one: Prompt, other: Prompt) -> Item:
     return Item("a:b:void", "void", about, lambda: one, lambda: other)
 
 
-def with_panel(of: LocalModel) -> tuple[Prompt, Prompt]:
-    """Prompts about four frames of 32 x 64 pixels, and about the same with a black panel over the right half of the
+def with_occluder(of: LocalModel) -> tuple[Prompt, Prompt]:
+    """Prompts about four frames of 32 x 64 pixels, and about the same with a black occluder over the right half of the
     last two."""
     frames = np.random.default_rng(0).integers(90, 255, (4, 32, 64, 3)).astype(np.uint8)
     covered = frames.copy()
@@ -110,10 +110,10 @@ def with_panel(of: LocalModel) -> tuple[Prompt, Prompt]:
     return one, other
 
 
-def test_states_at_panel_tokens_are_means_over_the_visual_tokens_that_the_panel_covers() -> None:
-    """A token is 32 x 32 pixels of two frames, so there are four: left and right, early and late. The panel is one."""
+def test_states_at_occluder_tokens_are_means_over_the_visual_tokens_that_the_occluder_covers() -> None:
+    """A token is 32 x 32 pixels of two frames, hence four: left and right, early and late. The occluder is one."""
     of = model("qwen3-vl")
-    one, other = with_panel(of)
+    one, other = with_occluder(of)
     mask = spans(of, one, SYSTEM, QUESTIONS[1])["visual"]
     visual, differs = np.flatnonzero(mask), changed_tokens(one, other, mask)
     assert one.inputs["video_grid_thw"].tolist() == [[2, 2, 4]] and len(visual) == 4
@@ -125,9 +125,9 @@ def test_states_at_panel_tokens_are_means_over_the_visual_tokens_that_the_panel_
             assert found == pytest.approx(own[torch.from_numpy(tokens)].mean(dim=0).numpy(), abs=1e-5)
 
 
-def test_states_at_panel_tokens_are_refused_where_nothing_differs_or_nothing_can_be_compared() -> None:
+def test_states_at_occluder_tokens_are_refused_where_nothing_differs_or_nothing_can_be_compared() -> None:
     of = model("qwen3-vl")
-    one, other = with_panel(of)
+    one, other = with_occluder(of)
     with pytest.raises(TrapsError, match=r"a:b:void: its prompt for .* has no changed; choose another pooling"):
         item_states(of, changed_item(one, one), one, "changed")
     same = item_states(of, changed_item(one, one), one, "unchanged").raw
@@ -136,6 +136,6 @@ def test_states_at_panel_tokens_are_refused_where_nothing_differs_or_nothing_can
         with pytest.raises(TrapsError, match="cannot be compared with those of the pair's other clip"):
             item_states(of, wrong, one, "changed")
     llava = model("llava-next-video")
-    one, other = with_panel(llava)
+    one, other = with_occluder(llava)
     with pytest.raises(TrapsError, match="pixels that do not come token by token"):
         item_states(llava, changed_item(one, other), one, "changed")

@@ -73,8 +73,8 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
         Check(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
-            "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that a panel closes "
-            "be answered from its last frame. `traps benchmark certify` computes this again.",
+            "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that an occluder "
+            "closes be answered from its last frame. `traps benchmark certify` computes this again.",
             _evidence(stored_evidence.answerable_voids),
         ),
         Check(
@@ -124,7 +124,7 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
     lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in clips.missing_clips(workspace, key)],
     checks=[
         Check(
-            "panel_hides",
+            "occluder_hides",
             "Nothing decisive has a pixel, shadow included, in any checked frame of an occluded void.",
             lambda workspace, key, output: {id_: pixels for id_, pixels in output.beside.items() if pixels},
         ),

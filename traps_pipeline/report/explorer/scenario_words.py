@@ -27,12 +27,12 @@ def intervention(spec: Mapping[str, Any]) -> str:
 
 _PHRASES = {
     "commit_s": "outcome settled at {} s",
-    "read_s": "in view for {:.1f} s before a panel comes",
+    "read_s": "in view for {:.1f} s before an occluder comes",
     "margin_m": "margin {} m",
     "least_visible_px": "at least {:.0f} pixels when last in view",
     "ablation_px": "{} pixels change without what is hidden",
     "cause_moving_s": "cause seen moving for {} s",
-    "panel_covers": "the panel covers {:.0%} of where things move",
+    "panel_covers": "the occluder covers {:.0%} of where things move",
     "twin_px": "{} pixels between void and twin's void",
     "entropy_bits": "futures disagree by {:.2f} bits",
     "top_share": "the best guess is right in {:.0%} of them",

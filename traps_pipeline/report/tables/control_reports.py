@@ -40,7 +40,7 @@ SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "−
 
 WHAT = {
     "occlusion_answerable": "void clip, answerable question",
-    "decoy": "decoy: a panel that hides nothing",
+    "decoy": "decoy: an occluder that hides nothing",
     "removed": "the void’s own panel, gone before the end",
     "length_matched": "whole clip as short as a void",
     "chaotic_time_swapped": "frame times of the other side",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 WHY = "no variation was run (traps run hypotheses)"
 _TITLES = {
     "answer space": "Answers to choose from",
-    "panel": "Look of the panel",
+    "occluder": "Look of the occluder",
     "schema": "Form of the answer",
     "frames": "Frames shown",
     "cut": "A cut that leaves the outcome predictable",
@@ -54,13 +54,13 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     notes = [
         f"change: in points, from “{hypothesis.doses[0].name}”, on the scenarios that both have; brackets: 95 % "
         "interval, Bayesian bootstrap over scenarios with one unseen",
-        "rules: panel-rule, length-rule and wording-rule, each of which reads one cue and understands nothing; what a "
-        "rule gets too, a model need not understand anything for; guess: Acc of a guess among the answers offered",
+        "rules: occluder-rule, length-rule and wording-rule, each of which reads one cue and understands nothing; what "
+        "a rule gets too, a model need not understand anything for; guess: Acc of a guess among the answers offered",
         "no part of PECS or of the arms' figures",
     ]
     if any(dose.counts_as.startswith("no void") for dose in hypothesis.doses):
         notes.append(
-            "through a panel of these alphas the outcome is seen: FalseAbs is the share that abstains all the same"
+            "through an occluder of these alphas the outcome is seen: FalseAbs is the share that abstains all the same"
         )
     refused = own.dropna(subset=["refused"]).to_dict("records")
     notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refused]

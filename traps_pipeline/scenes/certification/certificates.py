@@ -374,7 +374,7 @@ def _order(pair: Pair) -> Evidence:
     control, span = pair.control, pair.control.outcome.in_order
     if span is None:
         return {"order_frames": None}
-    span = (span[0], min(span[1], control.open_frames))  # what a panel hides is not seen
+    span = (span[0], min(span[1], control.open_frames))  # what an occluder hides is not seen
     return {"order_frames": fewest_within(len(control.qpos), control.physics.fps, span)}
 
 
@@ -405,13 +405,13 @@ def _first_hidden(pair: Pair) -> int:
 
 def _hidden(pair: Pair) -> Evidence:
     return {
-        "past_panel_px": pair.control.past_panel.leaked(_first_hidden(pair)),
+        "past_panel_px": pair.control.past_occluder.leaked(_first_hidden(pair)),
         "hidden_from_s": pair.void_from / pair.control.physics.fps,
     }
 
 
 def _judge_hidden(e: Evidence, claim: Claim) -> Judged:
-    late = "the panel does not hide the outcome before it is committed"
+    late = "the occluder does not hide the outcome before it is committed"
     if e.get("past_panel_px"):
         yield f"{late}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
     if e["hidden_from_s"] >= e["commit_s"]:
@@ -439,7 +439,7 @@ def _ablation(pair: Pair) -> Evidence:
 def _judge_ablation(e: Evidence, claim: Claim) -> Judged:
     if e["ablation_px"] != 0:
         change = f"taking it away changes {e['ablation_px']} pixels of the void"
-        yield f"something decisive reaches the eye past the panel: {change}"
+        yield f"something decisive reaches the eye past the occluder: {change}"
 
 
 ABLATION = Certificate(
@@ -461,7 +461,7 @@ def _judge_answer_of_twin(e: Evidence, claim: Claim) -> Judged:
         yield f"the twin ends in {e['twin_answer']!r}; {recorded}"
 
 
-def _twin_behind_panel(pair: Pair) -> Evidence:
+def _twin_behind_occluder(pair: Pair) -> Evidence:
     control, twin, twins = pair.control, pair.other_world, pair.control.family.twins
     pixels, _ = checks.differing_pixels(control.void_frames, twin.void_frames)
     return {
@@ -471,7 +471,7 @@ def _twin_behind_panel(pair: Pair) -> Evidence:
     }
 
 
-def _judge_twin_behind_panel(e: Evidence, claim: Claim) -> Judged:
+def _judge_twin_behind_occluder(e: Evidence, claim: Claim) -> Judged:
     if not e.get("hidden_alone", True):
         yield "the twin differs in more, or in less, than the hidden element"
     yield from _judge_answer_of_twin(e, claim)
@@ -479,15 +479,15 @@ def _judge_twin_behind_panel(e: Evidence, claim: Claim) -> Judged:
         yield f"the twin's void differs from the void: in {e['twin_px']} pixels"
 
 
-TWIN_BEHIND_PANEL = Certificate(
+TWIN_BEHIND_OCCLUDER = Certificate(
     name="twin",
     about="twin",
     promises="another world, different in the hidden element alone and with another answer, has the same void frames "
     "byte for byte: two worlds, one video, so no observer can know",
     does_not_promise="that the two worlds are equally likely a priori",
     numbers=(Number("hidden_alone", kept=False), Number("twin_answer", kept=False), Number("twin_px")),
-    measure=_twin_behind_panel,
-    judge=_judge_twin_behind_panel,
+    measure=_twin_behind_occluder,
+    judge=_judge_twin_behind_occluder,
     kinds=("occluder",),
 )
 
@@ -504,7 +504,7 @@ def _called(name: str, nouns: Sequence[str]) -> bool:
 
 def _referents(pair: Pair) -> Evidence:
     control = pair.control
-    assert control.panel is not None, "a pair with an occluder has a panel"
+    assert control.occluder is not None, "a pair with an occluder has an occluder"
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
     rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
     moving = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
@@ -534,7 +534,7 @@ def _referents(pair: Pair) -> Evidence:
         "referents_px": min(least_px, default=None),
         "referents_moving_s": None if not least_s else round(min(least_s), 3),
         "cause_moving_s": round(max(moves.values(), default=0.0), 3),
-        "panel_covers": checks.swept_behind(control.camera, list(swept.reshape(-1, 8, 3)), control.panel),
+        "panel_covers": checks.swept_behind(control.camera, list(swept.reshape(-1, 8, 3)), control.occluder),
     }
 
 
@@ -560,7 +560,7 @@ REFERENTS = Certificate(
     promises=f"everything that the question names has {REFERENT_PIXELS:.0f} pixels in every void frame, itself or by a "
     f"flag where it stands or begins in every world, or is seen moving for {MOVING_S} s before it is hidden (the "
     f"record says which); some body is seen moving for {MOVING_S} s; of the pixels over which anything moves, the "
-    "panel covers the stated share",
+    "occluder covers the stated share",
     does_not_promise="that a person takes the flag for the thing",
     numbers=(
         Number("referents"),
@@ -734,7 +734,7 @@ def _closing(pair: Pair) -> Evidence:
         return {**_closes(None, control.physics), **unread}
     outcome, end = control.outcome_read, control.closed_at
     changed = control.ablation_px(end, control.closed_off)
-    differing, _ = checks.differing_pixels(control.behind_panel(end), pair.other_world.behind_panel(end))
+    differing, _ = checks.differing_pixels(control.behind_occluder(end), pair.other_world.behind_occluder(end))
     return {
         **_closes(control.closing.frame, control.physics),
         "read_answer": outcome.label,
@@ -748,22 +748,23 @@ def _judge_closing(e: Evidence, claim: Claim) -> Judged:
     if e["closes_s"] is None:
         return
     if e.get("read_answer", claim.answer) != claim.answer:
-        yield f"before the panel comes the control shows {e['read_answer']!r}, the record says {claim.answer!r}"
+        yield f"before the occluder comes the control shows {e['read_answer']!r}, the record says {claim.answer!r}"
     if min(e["read_s"], e["closes_s"] - e["commit_s"]) < READ_S - _NOISE_S:
-        yield f"the panel comes at {e['closes_s']:.1f} s, less than {READ_S} s after the outcome has settled"
+        yield f"the occluder comes at {e['closes_s']:.1f} s, less than {READ_S} s after the outcome has settled"
     if e["closes_s"] > e["looks_until_s"] + _NOISE_S:
-        yield f"the panel comes at {e['closes_s']:.1f} s; some model is shown no frame after {e['looks_until_s']:.1f} s"
+        yield f"the occluder comes at {e['closes_s']:.1f} s; a model is shown no frame after {e['looks_until_s']:.1f} s"
     if e["closed_px"]:
-        yield f"{e['closed_px']:g} pixels of what the panel must hide are seen past it"
+        yield f"{e['closed_px']:g} pixels of what the occluder must hide are seen past it"
     if e["closed_change_px"]:
-        yield f"behind the panel the outcome changes {e['closed_change_px']} pixels of the control's end"
+        yield f"behind the occluder the outcome changes {e['closed_change_px']} pixels of the control's end"
 
 
 CLOSING = Certificate(
     name="closing",
     about="twin",
-    promises="where the control closes: the frames before the panel comes show the ground truth by themselves, settled "
-    f"for {READ_S} s or more; the panel stands to the end and in the last frame that a model is shown "
+    promises="where the control closes: the frames before the occluder comes show the ground truth by themselves, "
+    "settled "
+    f"for {READ_S} s or more; the occluder stands to the end and in the last frame that a model is shown "
     f"({', '.join(map(str, POLICIES))}); from its coming on no pixel shows a decisive body or the hidden element "
     "(chaotic: anything that moves), taking them away changes no pixel, and the twin, with its other answer, has the "
     "same frames byte for byte: nobody can answer from the last frame",
@@ -827,13 +828,13 @@ def _judge_exchange(e: Evidence, claim: Claim) -> Judged:
     if e.get("lost_exchanged") is not None:
         yield f"with the twin as the control: {e['lost_exchanged']}"
     if e["hidden_from_s"] >= e["twin_commit_s"]:
-        yield "the panel does not hide the outcome of the twin before it is settled"
+        yield "the occluder does not hide the outcome of the twin before it is settled"
     if e["closes_s"] is None:
         return
     if e.get("twin_read_answer", claim.twin_answer) != claim.twin_answer:
-        yield f"before the panel comes the twin shows {e['twin_read_answer']!r}, it ends in {claim.twin_answer!r}"
+        yield f"before the occluder comes the twin shows {e['twin_read_answer']!r}, it ends in {claim.twin_answer!r}"
     if e["closes_s"] - e["twin_commit_s"] < READ_S - _NOISE_S:
-        yield f"the panel comes at {e['closes_s']:.1f} s, less than {READ_S} s after the twin's outcome has settled"
+        yield f"the occluder comes at {e['closes_s']:.1f} s, less than {READ_S} s after the twin's outcome has settled"
 
 
 EXCHANGE = Certificate(
@@ -841,11 +842,11 @@ EXCHANGE = Certificate(
     about="worlds",
     promises="with control and twin exchanged, the length of the clip and the moment at which the control closes are "
     "computed again, and the record's are among those that a draw tries; the twin passes as a control: all that is "
-    "certified of a control holds for it, its outcome is hidden before it is settled, and is read before the panel "
+    "certified of a control holds for it, its outcome is hidden before it is settled, and is read before the occluder "
     "comes (on another CPU or version length and moment are not computed again)",
-    does_not_promise="that camera and panel are fitted again (a draw fits them to both worlds, in no order; of the "
-    "released records 61 have a camera, and 202 a panel, that was fitted to the control first); which of several other "
-    "worlds is the twin; anything of soft bodies, whose worlds settle too far apart for one length",
+    does_not_promise="that camera and occluder are fitted again (a draw fits them to both worlds, in no order; of the "
+    "released records 61 have a camera, and 202 an occluder, that was fitted to the control first); which of several "
+    "other worlds is the twin; anything of soft bodies, whose worlds settle too far apart for one length",
     numbers=(
         Number("twin_commit_s", 3),
         *(Number(name, kept=False) for name in ("twin_read_answer", "other_settings", "lost_exchanged")),
@@ -910,7 +911,7 @@ CERTIFICATES = (
     HIDDEN,
     ABLATION,
     REFERENTS,
-    TWIN_BEHIND_PANEL,
+    TWIN_BEHIND_OCCLUDER,
     CUT,
     OPEN,
     TWIN_OF_CUT,

@@ -26,7 +26,7 @@ class Verdict:
     failures: certificate -> why it cannot be given; empty if the record passes. measured: the evidence of all
     certificates. same_physics: whether simulating here gives the frozen trajectory bit by bit. control_end, void_end:
     digests of the clips' last frames; where these differ between scenarios the clips differ. at_cut: what moves at the
-    end of a void that is cut (`state_at_cut`); empty where a panel makes the void.
+    end of a void that is cut (`state_at_cut`); empty where an occluder makes the void.
     """
 
     scenario_id: str
@@ -97,13 +97,13 @@ def _same_physics(pair: Pair) -> bool:
 def _last_frames(pair: Pair) -> tuple[str, str]:
     """Return digests of the last frame of the control and of the void."""
     control, last = pair.control, len(pair.control.qpos) - 1
-    if control.panel is not None and control.closing is not None:
-        (end,) = control.behind_panel([last])
+    if control.occluder is not None and control.closing is not None:
+        (end,) = control.behind_occluder([last])
         return frames_digest([end]), frames_digest([end])
     with control.closed_renderer() as renderer:
-        end = list(renderer.frames(control.qpos[-1:], panel=control.closing is not None))
-        if control.panel is not None:
-            void = renderer.frames(control.qpos[-1:], panel=True)
+        end = list(renderer.frames(control.qpos[-1:], occluder=control.closing is not None))
+        if control.occluder is not None:
+            void = renderer.frames(control.qpos[-1:], occluder=True)
         else:
             void = renderer.frames(control.qpos[pair.void_from - 1 : pair.void_from])
         return frames_digest(end), frames_digest(list(void))

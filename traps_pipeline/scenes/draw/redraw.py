@@ -1,9 +1,9 @@
 """Giving released records what new draws of their family have: another look, or whatever rule is new.
 
 A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
-the record cost thousands of rollouts, and its new look moves neither camera nor panel, the worlds stay and what pixels
-say is measured again (`relook_family`). Either way it is the record that `sample_family` would have drawn; whoever uses
-it then runs `traps benchmark certify`.
+the record cost thousands of rollouts, and its new look moves neither camera nor occluder, the worlds stay and what
+pixels say is measured again (`relook_family`). Either way it is the record that `sample_family` would have drawn;
+whoever uses it then runs `traps benchmark certify`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
 
-# Parts of a look that move neither camera nor panel.
+# Parts of a look that move neither camera nor occluder.
 STILL = ("floor", "pale-floor", "light", "panel", "material", "bystanders")
 
 _Job = tuple[SceneSpec, Path, int]  # a record, the folder of trajectories and the seed of its family
@@ -139,7 +139,7 @@ def _relooked(job: _Job) -> Resolved | str:
 
 
 def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
-    """Return a record under a look that moves neither camera nor panel, or which certificate it loses; those of
+    """Return a record under a look that moves neither camera nor occluder, or which certificate it loses; those of
     rollouts stay. qpos, twin: its trajectories, (F, nq) each."""
     family = get_family(spec.family)
     dressed = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))

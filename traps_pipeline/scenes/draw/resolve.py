@@ -61,11 +61,11 @@ def resolve(
     answer = full.outcome.label
     if answer is not None and answer not in wording.labels:
         raise ValueError(f"{family.name}: reading {answer!r} is not one of the labels {list(wording.labels)}")
-    kind: VoidKind = "truncation" if full.panel is None else "occluder"
+    kind: VoidKind = "truncation" if full.occluder is None else "occluder"
     pair, evidence = _of_some_length(full, kind, wording, ill_posed_question, seed)
     control, physics = pair.control, pair.control.physics
     twin, frame = pair.other_world, pair.void_from
-    panel = None if control.panel is None else asdict(control.panel)
+    occluder = None if control.occluder is None else asdict(control.occluder)
     spec = SceneSpec(
         scenario_id=scenario_id,
         taxonomy=family.taxonomy,
@@ -77,7 +77,7 @@ def resolve(
         physics=asdict(physics),
         camera=plain(asdict(control.camera)),
         void_kind=kind,
-        void=plain({"cut_frame": frame} if panel is None else {"panel": panel, "hidden_from_frame": frame}),
+        void=plain({"cut_frame": frame} if occluder is None else {"panel": occluder, "hidden_from_frame": frame}),
         control=plain(record_of(pair)),
         question=wording.question,
         labels=list(wording.labels),
@@ -88,7 +88,7 @@ def resolve(
         answerable_question=plain(asdict(wording.answerable_question)),
         trajectory_sha256=trajectory_digest(control.qpos),
         twin=Twin(
-            params=None if panel is None else plain(params_to_dict(twin.params)),
+            params=None if occluder is None else plain(params_to_dict(twin.params)),
             rollout=pair.rollout,
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
@@ -123,18 +123,18 @@ def _of_some_length(
 
 
 def _control(family: Family, params: Any, physics: Physics) -> World:
-    """Return the control of a draw: simulated, and with its camera and panel fitted to itself."""
+    """Return the control of a draw: simulated, and with its camera and occluder fitted to itself."""
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
-    camera, panel = fit_shot(scene.view, shown_points(model, scene, qpos), scene.cover)
-    return World(family, params, physics, qpos, camera, panel, simulated=qpos)
+    camera, occluder = fit_shot(scene.view, shown_points(model, scene, qpos), scene.cover)
+    return World(family, params, physics, qpos, camera, occluder, simulated=qpos)
 
 
 def _first_certified(
     candidates: Iterable[Pair], kind: VoidKind, seed: int, so_far: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """Return the first of some pairs, which differ in their panel, whose void and twin are certified and whose control
-    can end. Raises Rejected if none is."""
+    """Return the first of some pairs, which differ in their occluder, whose void and twin are certified and whose
+    control can end. Raises Rejected if none is."""
     rejected = Rejected("there is no twin")
     for pair in candidates:
         try:
@@ -164,8 +164,8 @@ def _with_others(control: World) -> Iterator[tuple[World, World]]:
             continue  # this other world diverges; the next one may not
         world = replace(control, params=params, qpos=qpos, simulated=qpos)
         if settled_answer(world) not in (None, control.outcome.label):
-            camera, panel = shot_of((control, world))
-            yield replace(control, camera=camera, panel=panel), replace(world, camera=camera, panel=panel)
+            camera, occluder = shot_of((control, world))
+            yield replace(control, camera=camera, occluder=occluder), replace(world, camera=camera, occluder=occluder)
 
 
 # --- chaotic ----------------------------------------------------------------------------------------------------------

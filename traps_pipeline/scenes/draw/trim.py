@@ -1,9 +1,10 @@
-"""How little a panel covers: no more than its twin needs.
+"""How little an occluder covers: no more than its twin needs.
 
-A family says what its panel hides at the most, as a box (`Scene.cover`). How much of that must be hidden follows from
-the pair: where control and twin differ in any frame, where anything of the hidden element shows, and where decisive
-bodies, or their shadows, are from the last frame before the outcome settles. The panel is cut to that, upright on the
-floor as before, and the camera stays. What else the family's box held is then seen: it is the same in both worlds.
+A family says what its occluder hides at the most, as a box (`Scene.cover`). How much of that must be hidden follows
+from the pair: where control and twin differ in any frame, where anything of the hidden element shows, and where
+decisive bodies, or their shadows, are from the last frame before the outcome settles. The occluder is cut to that,
+upright on the floor as before, and the camera stays. What else the family's box held is then seen: it is the same in
+both worlds.
 """
 
 from __future__ import annotations
@@ -14,28 +15,28 @@ from dataclasses import replace
 import numpy as np
 
 from traps_pipeline.scenes.certification.evidence import Pair
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Panel
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Occluder
 from traps_pipeline.scenes.worlds.outcome import decisive_geoms
 
 MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the other
 
 
 def trimmed(pair: Pair) -> Iterator[Pair]:
-    """Yield the pair behind one panel after another, the smallest first: cut to what its twin needs with the one margin
-    and with the other, and as it is. Each may still lose a certificate. The pair must have a panel, a twin and an
-    outcome."""
-    panel = pair.control.panel
-    assert panel is not None, "only a panel can be trimmed"
+    """Yield the pair behind one occluder after another, the smallest first: cut to what its twin needs with the one
+    margin and with the other, and as it is. Each may still lose a certificate. The pair must have an occluder, a twin
+    and an outcome."""
+    occluder = pair.control.occluder
+    assert occluder is not None, "only an occluder can be trimmed"
     needed = must_hide(pair)
-    panels = [cut_to(panel, pair.control.camera, needed, margin) for margin in MARGINS_PX]
-    for smaller in dict.fromkeys((*panels, panel)):
-        control, twin = (replace(world, panel=smaller) for world in (pair.control, pair.other_world))
-        yield replace(pair, control=control, twin=twin, void_frame=control.past_panel.hidden_from())
+    occluders = [cut_to(occluder, pair.control.camera, needed, margin) for margin in MARGINS_PX]
+    for smaller in dict.fromkeys((*occluders, occluder)):
+        control, twin = (replace(world, occluder=smaller) for world in (pair.control, pair.other_world))
+        yield replace(pair, control=control, twin=twin, void_frame=control.past_occluder.hidden_from())
 
 
 def must_hide(pair: Pair) -> np.ndarray:
-    """Return the pixels of a 480x360 frame that a panel must cover, (H, W) bool, found without any panel; the same if
-    the two worlds are exchanged."""
+    """Return the pixels of a 480x360 frame that an occluder must cover, (H, W) bool, found without any occluder; the
+    same if the two worlds are exchanged."""
     needed, drawn = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
         until = max(world.outcome.commit_frame - 1, 0)
@@ -48,24 +49,24 @@ def must_hide(pair: Pair) -> np.ndarray:
     return needed | _differ(*drawn)
 
 
-def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> Panel:
-    """Return the least upright panel in a panel's plane, and within it, that covers some pixels (H, W) and so many
-    around them; the panel as it is if there are none."""
+def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
+    """Return the least upright occluder in an occluder's plane, and within it, that covers some pixels (H, W) and so
+    many around them; the occluder as it is if there are none."""
     rows, columns = np.nonzero(needed)
     if not len(rows):
-        return panel
+        return occluder
     left, right = columns.min() - margin_px, columns.max() + 1 + margin_px
     top, bottom = rows.min() - margin_px, rows.max() + 1 + margin_px
-    ahead, across = _directions(panel)
+    ahead, across = _directions(occluder)
     corners = np.array([[x, y] for x in (left, right) for y in (top, bottom)], dtype=float)
-    on_plane = _on_plane(camera, corners, ahead, float(np.array(panel.centre) @ ahead) - panel.half[1])
-    side, middle = on_plane @ across, float(np.array(panel.centre) @ across)
-    low, high = max(side.min(), middle - panel.half[0]), min(side.max(), middle + panel.half[0])
-    height = min(float(on_plane[:, 2].max()), 2 * panel.half[2])
-    centre = np.array(panel.centre) + across * ((low + high) / 2 - middle)
+    on_plane = _on_plane(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
+    side, middle = on_plane @ across, float(np.array(occluder.centre) @ across)
+    low, high = max(side.min(), middle - occluder.half[0]), min(side.max(), middle + occluder.half[0])
+    height = min(float(on_plane[:, 2].max()), 2 * occluder.half[2])
+    centre = np.array(occluder.centre) + across * ((low + high) / 2 - middle)
     x, y = (round(float(v), 6) for v in centre[:2])
-    half = (round((high - low) / 2, 6), panel.half[1], round(height / 2, 6))
-    return replace(panel, centre=(x, y, half[2]), half=half)
+    half = (round((high - low) / 2, 6), occluder.half[1], round(height / 2, 6))
+    return replace(occluder, centre=(x, y, half[2]), half=half)
 
 
 def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.ndarray:
@@ -78,9 +79,9 @@ def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.nd
     return masks
 
 
-def _directions(panel: Panel) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors of a panel: away from the camera, and to the camera's right."""
-    azimuth = np.radians(panel.yaw_deg + 90.0)
+def _directions(occluder: Occluder) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit vectors of an occluder: away from the camera, and to the camera's right."""
+    azimuth = np.radians(occluder.yaw_deg + 90.0)
     return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
 
 

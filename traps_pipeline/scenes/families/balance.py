@@ -1,6 +1,6 @@
 """A ball rolls off a shelf into a cup on one arm of a beam; the question is how the beam comes to rest.
 
-Control: the whole beam is in view. Void: the panel stands before it, and only the shelf with the ball is seen.
+Control: the whole beam is in view. Void: the occluder stands before it, and only the shelf with the ball is seen.
 Hidden element: the place of a counterweight on the other arm. Close to the pivot the ball outweighs it, far out it
 outweighs the ball, and at one place between the beam hangs level.
 """
@@ -71,17 +71,17 @@ def build(p: Params, physics: Physics) -> Scene:
     drop_at = float(p.arm_m * cos - (BEAM_HALF_M + r) * sin)  # before the pivot, over the cup of the raised arm
     z = float(p.pivot_z_m + (p.half_beam_m * sin + (BEAM_HALF_M + CUP_M) * cos) + 0.03)  # the shelf clears that cup
     edge, stop = -drop_at - r - DROP_SLACK_M, -drop_at + r + DROP_SLACK_M
-    panel_at, end, high = -p.half_beam_m - 0.03, p.half_beam_m + 0.03, z + 2 * r + 0.02
-    start, deep, over = panel_at - p.run_m, (-side, side), (z, z + 0.3 * r)
+    occluder_at, end, high = -p.half_beam_m - 0.03, p.half_beam_m + 0.03, z + 2 * r + 0.02
+    start, deep, over = occluder_at - p.run_m, (-side, side), (z, z + 0.3 * r)
 
-    course.block("table", (start, panel_at), deep, (0, z), p.shelf_colour)
-    course.block("shelf", (panel_at, edge), deep, (z - 0.012, z), p.shelf_colour)
+    course.block("table", (start, occluder_at), deep, (0, z), p.shelf_colour)
+    course.block("shelf", (occluder_at, edge), deep, (z - 0.012, z), p.shelf_colour)
     course.block("shelf_front", (start, edge), (-side, -side + 0.012), over, p.board_colour)
     course.block("shelf_back", (start, edge), (side - 0.012, side), over, p.board_colour)
     behind = (stop, stop + 0.012), (-0.6 * side, side), (z - 0.01, z + 1.5 * r)
     backstop = course.block("backstop", *behind, p.shelf_colour)
     backstop.priority, backstop.solref = 1, list(DEAD)
-    course.block("board", (panel_at, end), (side, side + 0.015), (0, high), p.board_colour)
+    course.block("board", (occluder_at, end), (side, side + 0.015), (0, high), p.board_colour)
     course.block("base", (-p.half_beam_m, p.half_beam_m), (-side - 0.02, side), (0, 0.025), "black")
     axle = (-0.016, 0.016), (-0.05, side), (p.pivot_z_m - 0.016, p.pivot_z_m + 0.016)
     course.block("axle", *axle, "white", solid=False)
@@ -93,7 +93,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["beam"],
         hidden=["counterweight"],
-        cover=course.box((panel_at, end), (-side - 0.02, side + 0.03), (0, high + 0.02), right=0.02),
+        cover=course.box((occluder_at, end), (-side - 0.02, side + 0.03), (0, high + 0.02), right=0.02),
         in_view=[course.box((start, end), deep, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.beam_colour} beam", "shelf", "counterweight", "cup"],
         also=["board", "base"],

@@ -1,7 +1,7 @@
 """A ball rolls along a lane behind a wall with two windows; the question is whether it comes out at the other end.
 
 Control: the windows and the tray at the end are in view, so that a ball which stays behind the wall is seen in the
-second window. Void: the panel stands before the wall and the tray.
+second window. Void: the occluder stands before the wall and the tray.
 Hidden element: a block, which lies across the lane below the second window or beside the lane.
 """
 
@@ -61,7 +61,7 @@ class Params:
     height_m: float = between(0.28, 0.33)
     windows_m: tuple[float, ...] = drawn_by(_windows)  # middle of each window
     window_m: float = between(0.19, 0.22)  # width of a window
-    mouth_m: float = between(0.08, 0.11)  # part of the wall that is seen beside the panel
+    mouth_m: float = between(0.08, 0.11)  # part of the wall that is seen beside the occluder
     tray_m: float = between(0.26, 0.32)
     merlons: int = one_of(4, 5, 6)
     azimuth_deg: float = in_front(-15, 15)

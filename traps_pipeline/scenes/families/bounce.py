@@ -1,6 +1,6 @@
 """A ball rolls off a table and drops; the question is whether it bounces over a wall.
 
-Control: the pad under the table's edge, the wall and the tray behind it are in view. Void: the panel stands before
+Control: the pad under the table's edge, the wall and the tray behind it are in view. Void: the occluder stands before
 all of that.
 Hidden element: the pad that the ball lands on, which is lively (the ball leaps over the wall) or dead (it stays before
 the wall). The pads look the same, and nothing that the ball does before it lands tells them apart.
@@ -77,7 +77,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["pad"],
-        # The panel begins a little beyond the edge: a ball just hidden has left the table.
+        # The occluder begins a little beyond the edge: a ball just hidden has left the table.
         cover=course.box((0.03, end + 0.02), (-side - rim, side + 0.03), (0, top + 0.02), right=0.02),
         in_view=[course.box((-p.table_m, end), deep, (0, top))],
         things=[f"{p.ball_colour} ball", f"{p.wall_colour} wall", "table", "tray", f"{p.pad_colour} pad"],

@@ -1,8 +1,8 @@
 """A ball is thrown in a high arc; the question is whether it lands in the basket.
 
-Control: the walled pen that it comes down in is in view, and the basket in it. Void: the panel stands before the pen.
-Hidden element: the basket, which stands where the ball comes down or a step before or beyond. The throw is the same
-either way, and the walls of the pen keep the ball behind the panel.
+Control: the walled pen that it comes down in is in view, and the basket in it. Void: the occluder stands before the
+pen. Hidden element: the basket, which stands where the ball comes down or a step before or beyond. The throw is the
+same either way, and the walls of the pen keep the ball behind the occluder.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A ball rolls down a ramp into a row of balls that pass the impact on; the question is whether the last one rolls into
 the coloured box.
 
-Control: the whole row and the box are in view. Void: the panel stands before them; the striker rolls in behind it.
+Control: the whole row and the box are in view. Void: the occluder stands before them; the striker rolls in behind it.
 Hidden element: a peg that stands between two balls of the row and stops the impact there, or stands beside the row.
 The ramp ends in a step, so that nothing that happens in the row comes back out.
 """

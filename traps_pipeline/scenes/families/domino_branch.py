@@ -1,10 +1,10 @@
 """A row of dominoes comes towards the camera and splits in two branches; the question is at the end of which branch the
 domino falls, the left one or the right one.
 
-Control: both branches are in view. Void: the panel stands before them; the row is seen to fall behind it.
+Control: both branches are in view. Void: the occluder stands before them; the row is seen to fall behind it.
 Hidden element: one domino of either branch, of which one stands in its branch and the other lies beside it.
-The last visible domino only kicks a ball that rolls behind the panel, drives in between the two branches and is stopped
-by a post there: nothing that the gap changes can push back on what is seen.
+The last visible domino only kicks a ball that rolls behind the occluder, drives in between the two branches and is
+stopped by a post there: nothing that the gap changes can push back on what is seen.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from traps_pipeline.scenes.parts.observers import end_of, struck, upper_half_sta
 from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
-from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_panel, largest, track
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_occluder, largest, track
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
 
-STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the panel, out of the domino's reach
+STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the occluder, out of the domino's reach
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
 SIDES = ("left", "right")
 FLATTER = 1.3  # times as high for its width, at least, is a domino that stands beside one that lies
@@ -176,7 +176,7 @@ def _stands(frames: np.ndarray, colour: str) -> bool | None:
     """Return whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the
     end."""
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
-    if first is None or last is None or is_panel(first) or is_panel(last):
+    if first is None or last is None or is_occluder(first) or is_occluder(last):
         return None
     return upper_half_stays(frames, colour, first)
 

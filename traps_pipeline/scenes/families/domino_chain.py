@@ -1,9 +1,9 @@
 """A row of dominoes is set off by a rolling ball; the question is whether the last one falls.
 
-Control: the whole row is in view. Void: the panel stands before its second part.
+Control: the whole row is in view. Void: the occluder stands before its second part.
 Hidden element: one domino of the second part, which stands in the row or lies beside it and leaves a gap.
-The last visible domino only kicks a ball that is behind the panel from the start and that two posts stop after it has
-struck the second part: nothing that the gap changes can push back on what is seen.
+The last visible domino only kicks a ball that is behind the occluder from the start and that two posts stop after it
+has struck the second part: nothing that the gap changes can push back on what is seen.
 """
 
 from __future__ import annotations

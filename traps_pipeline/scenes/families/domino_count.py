@@ -1,10 +1,10 @@
 """A short row of dominoes is set off by a rolling ball, and kicks a ball into a second row; the question is how many
 dominoes of the second row fall.
 
-Control: both rows are in view. Void: the panel stands before the second row.
+Control: both rows are in view. Void: the occluder stands before the second row.
 Hidden element: where the second row has its gap, which the fall does not bridge.
-The last visible domino only kicks a ball that is behind the panel from the start and that two posts stop after it has
-struck the second row: nothing that the gap changes can push back on what is seen.
+The last visible domino only kicks a ball that is behind the occluder from the start and that two posts stop after it
+has struck the second row: nothing that the gap changes can push back on what is seen.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A ball drops onto a ridge between two bins; the question is on which side it comes down.
 
-Control: ridge and bins are in view, the left bin red and the right one blue. Void: the panel stands before them.
+Control: ridge and bins are in view, the left bin red and the right one blue. Void: the occluder stands before them.
 Hidden element: the ridge, which stands a little to the left or to the right of where the ball comes down. The drop is
 the same either way and drifts to either side, whichever the ridge then turns the ball to.
 """

@@ -1,8 +1,8 @@
 """A ball rolls off a shelf into a funnel; the question is whether it comes through into the cup below.
 
-Control: funnel and cup are in view. Void: the panel stands before them, the shelf beside it stays in view.
+Control: funnel and cup are in view. Void: the occluder stands before them, the shelf beside it stays in view.
 Hidden element: the two boards of the funnel, which leave a throat that is wider or narrower than the ball. The ball
-rolls in the same either way, and in either case it stays behind the panel.
+rolls in the same either way, and in either case it stays behind the occluder.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Two balls roll down ramps at each other, collide on the deck between them and end on one half of it; the question is
 which of them came from that half.
 
-Control: the whole deck is in view. Void: the panel stands before it; both balls are seen to roll in behind it.
+Control: the whole deck is in view. Void: the occluder stands before it; both balls are seen to roll in behind it.
 Hidden element: a rough board on one half of the deck. The ball that crosses it arrives slowly and is knocked back. The
 ramps end in steps, so that neither ball comes back out; their small head starts are only a lure.
 """
@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.observers import AHEAD, colours_of_balls, end_o
 from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.readings import Reading, held_from, still_from, undecided
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, several_between, shuffled
-from traps_pipeline.scenes.parts.vision import is_panel, largest, track
+from traps_pipeline.scenes.parts.vision import is_occluder, largest, track
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
 
 DECK_M = 0.035
@@ -140,7 +140,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = 
     for colour in colours_of_balls(frames, named, BALL_COLOURS):
         path = track(frames, colour, 60)
         start, end = path[0], end_of(path, ahead)
-        if line is None or start is None or end is None or is_panel(start) or is_panel(end):
+        if line is None or start is None or end is None or is_occluder(start) or is_occluder(end):
             return None
         if (start.x - line.x) * (end.x - line.x) > 0:
             kept.append(colour)

@@ -1,6 +1,6 @@
 """Two balls roll towards each other on a track of two lanes; the question is whether they collide.
 
-Control: the middle of the track, where the lanes are linked, is in view. Void: the panel stands before it.
+Control: the middle of the track, where the lanes are linked, is in view. Void: the occluder stands before it.
 Hidden element: a switch board, which lies between the lanes or is turned so that it leads one ball to the other lane.
 Which lanes the balls enter by does not tell: balls of one lane may be parted, balls of two lanes brought together.
 """

@@ -1,6 +1,6 @@
 """A ball rolls along a high track into a chute and drops on a plate; the question is to which side it drops off.
 
-Control: the plate below the chute and the two bins are in view. Void: the panel stands before them.
+Control: the plate below the chute and the two bins are in view. Void: the occluder stands before them.
 Hidden element: the plate is tilted to the left or to the right. The ball drops straight on its middle, whatever the
 track and the chute look like; a board behind the bins catches the shadows.
 """

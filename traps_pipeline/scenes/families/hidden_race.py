@@ -1,6 +1,6 @@
 """Balls race through a tunnel in lanes of their own; the question is which colour comes out first.
 
-Control: the far end of the tunnel and the tray behind it are in view. Void: the panel stands before them.
+Control: the far end of the tunnel and the tray behind it are in view. Void: the occluder stands before them.
 Hidden element: inside the tunnel every lane but one crosses a rough board that slows its ball to a creep. The visible
 run-up says nothing about which lane is clear, so the ball that enters first is only a lure.
 """
@@ -61,7 +61,7 @@ class Params:
     creep_m_s: float = between(0.17, 0.22)  # speed at which a ball leaves a rough board
     radius_m: float = between(0.046, 0.056)
     run_m: float = between(0.38, 0.46)  # open lane before the tunnel
-    mouth_m: float = between(0.09, 0.13)  # part of the tunnel that is seen beside the panel
+    mouth_m: float = between(0.09, 0.13)  # part of the tunnel that is seen beside the occluder
     tunnel_m: float = between(0.55, 0.61)
     tray_m: float = between(0.28, 0.34)
     azimuth_deg: float = facing(-16, 22)
@@ -84,7 +84,7 @@ def build(p: Params, physics: Physics) -> Scene:
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
     deep, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
-    rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the panel
+    rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the occluder
     after = rough_at + ROUGH_BOARD_M
 
     course.block("deck_in", (-0.03, rough_at), deep, (0, DECK_M), p.deck_colour)

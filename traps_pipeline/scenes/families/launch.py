@@ -1,6 +1,6 @@
 """A ball runs down a slide and up a kicker that throws it into the air; the question is whether it clears a barrier.
 
-Control: slide, kicker, barrier and the tray behind it are in view. Void: the panel stands before all but the upper
+Control: slide, kicker, barrier and the tray behind it are in view. Void: the occluder stands before all but the upper
 slide.
 Hidden element: the barrier, which is low (the ball flies over it) or tall (the ball strikes it and drops into the pit
 between kicker and barrier). The slide says nothing about it.

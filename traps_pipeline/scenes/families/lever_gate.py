@@ -1,8 +1,9 @@
 """A ball rolls towards a gate that hangs from a lever; the question is whether it gets past.
 
-Control: lever, gate and the lane beyond are in view. Void: the panel stands before them.
+Control: lever, gate and the lane beyond are in view. Void: the occluder stands before them.
 Hidden element: the counterweight on the lever, which sits far out (the lever holds the gate up) or close to the pivot
-(the gate hangs down and the lever's stop locks it). The ball drops down a step behind the panel: it cannot come back.
+(the gate hangs down and the lever's stop locks it). The ball drops down a step behind the occluder: it cannot come
+back.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box
 
-FLOOR_M = 0.03  # the lane behind the panel
+FLOOR_M = 0.03  # the lane behind the occluder
 STEP_M = 0.02  # the visible lane lies higher by this
 STEP_AT_M = 0.07
 GAP_M = 0.012  # under the shut gate
@@ -29,7 +30,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths along the lane are measured from the edge of the panel."""
+    """direction: +1 rolls to the right. Lengths along the lane are measured from the edge of the occluder."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()

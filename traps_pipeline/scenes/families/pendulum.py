@@ -1,9 +1,9 @@
 """A ball strikes the bob of a hanging pendulum; the question is whether the pendulum knocks over a block.
 
-Control: pendulum and block are in view. Void: the panel stands before them and only the ball's run-up is seen.
+Control: pendulum and block are in view. Void: the occluder stands before them and only the ball's run-up is seen.
 Hidden element: a peg in the board behind the pendulum. It sticks out just before the rod, and stops the swing before
-the bob reaches the block, or farther along, where the rod does not get. The ball stays behind the panel: it drops down
-a step there, and a lip stops it once it has struck.
+the bob reaches the block, or farther along, where the rod does not get. The ball stays behind the occluder: it drops
+down a step there, and a lip stops it once it has struck.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths along the way are measured from the edge of the panel."""
+    """direction: +1 rolls to the right. Lengths along the way are measured from the edge of the occluder."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -47,7 +47,7 @@ class Params:
     radius_m: float = between(0.046, 0.054)  # of the ball and of the bob
     speed_m_s: float = between(0.75, 0.95)
     run_m: float = between(0.55, 0.68)  # visible lane
-    lane_m: float = between(0.09, 0.12)  # height of the lane behind the panel over the floor
+    lane_m: float = between(0.09, 0.12)  # height of the lane behind the occluder over the floor
     pivot_at_m: float = between(0.32, 0.37)
     length_m: float = between(0.30, 0.36)
     stop_deg: float = between(3.5, 5.0)  # swing that a stopping peg allows

@@ -1,6 +1,6 @@
 """A ball rolls down a ramp towards the camera and onto a table; the question is into which bin it is deflected.
 
-Control: the table and the bins at its sides are in view. Void: the panel stands before them, the ramp is in view.
+Control: the table and the bins at its sides are in view. Void: the occluder stands before them, the ramp is in view.
 Hidden element: the deflector on the table, a board that is turned to the left or to the right.
 """
 

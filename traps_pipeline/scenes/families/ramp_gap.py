@@ -1,6 +1,6 @@
 """A ball rolls down a ramp and along a deck with a box at its end; the question is whether it reaches the box.
 
-Control: the whole deck and the box are in view. Void: the panel stands before all but the beginning of the deck.
+Control: the whole deck and the box are in view. Void: the occluder stands before all but the beginning of the deck.
 Hidden element: a board that bridges a gap in the deck, or lies on the ground below it, so that the ball falls in.
 """
 
@@ -38,8 +38,8 @@ class Params:
     ramp_m: float = between(0.36, 0.46)  # length of the ramp's surface
     start_m: float = between(0.06, 0.13)  # from the ramp's top to where the ball starts
     deck_m: float = between(0.13, 0.17)  # height of the deck
-    mouth_m: float = between(0.04, 0.10)  # deck that is seen before the panel
-    lead_m: float = drawn_by(  # deck behind the panel before the gap
+    mouth_m: float = between(0.04, 0.10)  # deck that is seen before the occluder
+    lead_m: float = drawn_by(  # deck behind the occluder before the gap
         lambda rng, so_far: 2 * so_far["radius_m"] + uniform(rng, 0.06, 0.11)
     )
     gap_m: float = drawn_by(lambda rng, so_far: uniform(rng, 3.3, 3.8) * so_far["radius_m"])

@@ -1,7 +1,7 @@
 """Two balls roll down ramps side by side, towards the camera; the question is which one is first in the tray.
 
-Control: tracks and tray are in view. Void: the panel stands before them, only the upper parts of the ramps are in view.
-Hidden element: one of the tracks crosses a rough board that slows its ball to a creep. The starting
+Control: tracks and tray are in view. Void: the occluder stands before them, only the upper parts of the ramps are in
+view. Hidden element: one of the tracks crosses a rough board that slows its ball to a creep. The starting
 places, of which one is higher than the other, say nothing about which track it is.
 """
 
@@ -105,7 +105,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("tray_side_1", (half, outer[1]), deep, rim, p.tray_colour)
     course.block("divider", (-0.006, 0.006), deep, (0, 0.9 * r), p.tray_colour)
 
-    hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the panel with its shadow
+    hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the occluder with its shadow
     high = p.track_m + 2 * r + 0.015
     _, back, top = ramps[0].at(p.ramp_m)
     beside = half if p.azimuth_deg < 94 else -half  # where no ball rolls behind the flag
@@ -151,7 +151,7 @@ def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.colours[side])
 
 
-SETTLING_PX = 8.0  # so far a ball may still roll in the tray when a panel comes
+SETTLING_PX = 8.0  # so far a ball may still roll in the tray when an occluder comes
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:

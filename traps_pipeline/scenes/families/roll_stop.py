@@ -1,6 +1,6 @@
 """A ball rolls along a track with a line across it; the question is whether it passes the line.
 
-Control: the whole track is in view. Void: the panel stands before all but its first part.
+Control: the whole track is in view. Void: the occluder stands before all but its first part.
 Hidden element: a patch of the track before the line, rough enough to stop the ball, or as smooth as the track.
 A ball that passes the line stays at the felt before the end wall.
 """
@@ -37,15 +37,15 @@ class Params:
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
-    start_colour: str = PLAY()  # of the line outside the panel
+    start_colour: str = PLAY()  # of the line outside the occluder
     line_colour: str = PLAY()
     track_colour: str = PLAIN()
     wall_colour: str = PLAIN()
     radius_m: float = between(0.048, 0.058)
     rough: bool = hidden(False, True)
     speed_m_s: float = between(0.55, 0.80)
-    run_m: float = between(0.56, 0.66)  # track before the panel
-    lead_m: float = drawn_by(  # track behind the panel before the patch
+    run_m: float = between(0.56, 0.66)  # track before the occluder
+    lead_m: float = drawn_by(  # track behind the occluder before the patch
         lambda rng, so_far: 2 * so_far["radius_m"] + uniform(rng, 0.04, 0.08)
     )
     patch_m: float = between(0.22, 0.30)

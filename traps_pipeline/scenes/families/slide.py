@@ -1,6 +1,6 @@
 """A block slides down an incline and across a slick deck; the question is whether it slides off the end.
 
-Control: deck and tray are in view. Void: the panel stands before them, the incline is in view.
+Control: deck and tray are in view. Void: the occluder stands before them, the incline is in view.
 Hidden element: a rough board in the deck, which stands out of it and stops the block, or is sunk into it. A block that
 leaves the deck falls into the tray behind it.
 """
@@ -55,8 +55,8 @@ class Params:
     deck_friction: float = between(0.03, 0.06)
     rough_friction: float = between(0.75, 0.95)
     deck_m: float = between(0.12, 0.16)  # height of the deck
-    mouth_m: float = between(0.03, 0.08)  # deck that is seen before the panel
-    lead_m: float = drawn_by(  # deck behind the panel before the board
+    mouth_m: float = between(0.03, 0.08)  # deck that is seen before the occluder
+    lead_m: float = drawn_by(  # deck behind the occluder before the board
         lambda rng, so_far: 2 * so_far["block_half_m"][0] + uniform(rng, 0.05, 0.09)
     )
     board_m: float = between(0.24, 0.30)

@@ -1,6 +1,6 @@
 """A soft ball is tossed up and falls between two pairs of bars; the question is on which of them it gets stuck.
 
-Control: both pairs and the tray below are in view. Void: the panel stands before them.
+Control: both pairs and the tray below are in view. Void: the occluder stands before them.
 Hidden element: how far apart the bars are. No gap is as wide as the ball: through the wider ones it squeezes, on the
 narrow ones it stays. An extension: no part of the benchmark (docs/scenes.md, "Soft bodies").
 """

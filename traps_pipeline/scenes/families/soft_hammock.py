@@ -1,6 +1,6 @@
 """A ball is tossed up and falls on a cloth that hangs between posts; the question is whether the cloth catches it.
 
-Control: cloth, posts and tray are in view. Void: the panel stands before them.
+Control: cloth, posts and tray are in view. Void: the occluder stands before them.
 Hidden element: the cloth, which is tied to the posts at both ends, so that the ball comes to lie in it, or at one end
 alone, so that it hangs down there and lets the ball pass. An extension: no part of the benchmark (docs/scenes.md, "Soft
 bodies").

@@ -1,6 +1,6 @@
 """A rope is tossed up and falls onto a peg; the question is whether it stays hanging there.
 
-Control: the peg in the board and the tray below are in view. Void: the panel stands before them.
+Control: the peg in the board and the tray below are in view. Void: the occluder stands before them.
 Hidden element: the peg, which sticks out of the board below the middle of the rope, where the rope comes to hang over
 it, or below one end, where the rope slides off into the tray. No part of the rope is seen any more when it meets the
 peg. An extension: no part of the benchmark (docs/scenes.md, "Soft bodies").

@@ -1,6 +1,6 @@
 """A ball strikes the pointer of a spinner; the question is which coloured sector the pointer stops in.
 
-Control: spinner and ball are in view from above. Void: the panel stands before the whole spinner; only the ball's
+Control: spinner and ball are in view from above. Void: the occluder stands before the whole spinner; only the ball's
 run-up is seen.
 Hidden element: the peg that stops the pointer, which may stand in any of the sectors.
 """
@@ -49,7 +49,7 @@ class Params:
     disc_m: float = between(0.30, 0.34)
     radius_m: float = between(0.042, 0.050)
     speed_m_s: float = between(0.95, 1.2)
-    run_m: float = between(0.74, 0.84)  # visible lane before the panel
+    run_m: float = between(0.74, 0.84)  # visible lane before the occluder
     ball_colour: str = drawn_by(  # that no sector has
         lambda rng, so_far: str(rng.choice([colour for colour in BALLS if colour not in so_far["sectors"]]))
     )

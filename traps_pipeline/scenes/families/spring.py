@@ -1,8 +1,8 @@
 """A ball rolls through a tunnel and off a deck to a plunger; the question is whether it is thrown back over a line.
 
-Control: plunger and line are in view. Void: the panel stands before both.
+Control: plunger and line are in view. Void: the occluder stands before both.
 Hidden element: the plunger, whose spring is lively or stuck fast in thick grease. The ball arrives the same either way;
-it drops down a step behind the panel, so that what comes back stays there, and felt brings it to rest.
+it drops down a step behind the occluder, so that what comes back stays there, and felt brings it to rest.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Params:
     tunnel_colour: str = PLUNGER()
     radius_m: float = between(0.054, 0.062)
     speed_m_s: float = between(0.95, 1.15)
-    run_m: float = between(0.78, 0.88)  # open deck before the panel
+    run_m: float = between(0.78, 0.88)  # open deck before the occluder
     step_m: float = between(0.06, 0.08)  # height of the deck over the lane
     lane_m: float = between(0.50, 0.56)  # from the step to the plunger's head
     line_m: float = between(0.21, 0.24)  # from the plunger's head to the line

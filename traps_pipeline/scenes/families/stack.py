@@ -1,6 +1,6 @@
 """A rolling ball drives a pusher that sweeps blocks off a stack; the question is how many stay on the stand.
 
-Control: ball, pusher, stack and tray are in view. Void: the panel stands before all of them but the ball's run-up.
+Control: ball, pusher, stack and tray are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: the height of the stand. The pusher's plate passes just over the ledge that the ball rolls on, so the
 blocks that stand higher than the ledge are swept off and those below it stay.
 """
@@ -43,7 +43,7 @@ class Params:
     block_height_m: float = between(0.054, 0.062)
     block_width_m: float = between(0.086, 0.104)
     speed_m_s: float = between(0.95, 1.15)
-    run_m: float = between(0.72, 0.82)  # visible ledge before the panel
+    run_m: float = between(0.72, 0.82)  # visible ledge before the occluder
     tray_m: float = between(0.34, 0.40)
     ball_colour: str = one_of("orange", "cyan")
     azimuth_deg: float = facing(-14, 20)
@@ -82,7 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
     plate, end = -half_w - 0.025, stand + p.tray_m
     screened = plate - ROD_M - 2 * RADIUS_M - 0.07
     start = screened - p.run_m + RADIUS_M
-    felt = plate - ROD_M - 2 * RADIUS_M - 0.02  # where it begins: the ball comes to rest on it, behind the panel
+    felt = plate - ROD_M - 2 * RADIUS_M - 0.02  # where it begins: the ball comes to rest on it, behind the occluder
     deck, high = (ledge - 0.025, ledge), ledge + 0.6 * len(COLOURS) * p.block_height_m
 
     course.block("ledge", (start - 0.06, felt), (-0.075, 0.075), deck, p.ledge_colour, Surface(1e-4))

@@ -1,6 +1,6 @@
 """A ball is thrown into a chute over three coloured trays; the question is in which tray it lands.
 
-Control: chute and trays are in view. Void: the panel stands before them.
+Control: chute and trays are in view. Void: the occluder stands before them.
 Hidden element: the two parallel boards of the chute, which hang straight down over the middle tray or slant towards the
 left or the right one. The throw is the same whichever way they slant, and the trays' walls keep the ball.
 """

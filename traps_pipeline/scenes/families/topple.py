@@ -1,6 +1,6 @@
 """A ball rolls off a ledge against a tall pillar; the question is whether the pillar topples over.
 
-Control: ledge, pillar and the ground behind it are in view. Void: the panel stands before all of them but the ball's
+Control: ledge, pillar and the ground behind it are in view. Void: the occluder stands before all of them but the ball's
 run-up.
 Hidden element: a prop that stands right behind the pillar or off to its side, or the pillar itself, which looks the
 same but is light or heavy.
@@ -22,7 +22,7 @@ from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one
 from traps_pipeline.scenes.parts.vision import at_rest, largest, track
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
-FELT = Surface(2e-3)  # behind the panel: no ball comes back from there
+FELT = Surface(2e-3)  # behind the occluder: no ball comes back from there
 LIGHT, HEAVY = 200.0, 7000.0  # kg/m3
 MAT_M = 0.01  # thickness of the mat
 HALF_DEPTH_M = 0.17  # of the mat
@@ -49,7 +49,7 @@ class Params:
     strike: float = between(0.60, 0.72)  # height at which the ball strikes
     radius_m: float = between(0.047, 0.056)
     speed_m_s: float = between(0.80, 1.0)
-    run_m: float = between(0.64, 0.74)  # visible ledge before the panel
+    run_m: float = between(0.64, 0.74)  # visible ledge before the occluder
     azimuth_deg: float = facing(-14, 20)
     elevation_deg: float = between(-32, -21)
 

@@ -1,6 +1,6 @@
 """A ball rolls along a ledge towards a tower of blocks; the question is whether its top block is knocked down.
 
-Control: ledge, tower and tray are in view. Void: the panel stands before all of them but the ball's run-up.
+Control: ledge, tower and tray are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: a stop that stands in the ball's way or beside it, or a strip of the ledge that is rough or smooth:
 the ball strikes the tower near its top, or never reaches it.
 """
@@ -22,7 +22,7 @@ from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, tr
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 STRIP_M = 0.16  # length of the strip that is rough or smooth
-FELT = Surface(2e-3)  # behind the panel: no ball comes back from there
+FELT = Surface(2e-3)  # behind the occluder: no ball comes back from there
 HALF_DEPTH_M = 0.11
 STILL_M = 0.003
 COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
@@ -53,7 +53,7 @@ class Params:
         lambda rng, so_far: so_far["blocks"] - uniform(rng, 0.45, 0.60)
     )
     speed_m_s: float = between(0.85, 1.05)
-    run_m: float = between(0.66, 0.76)  # visible ledge before the panel
+    run_m: float = between(0.66, 0.76)  # visible ledge before the occluder
     tray_m: float = between(0.32, 0.38)
     azimuth_deg: float = facing(-14, 20)
     elevation_deg: float = between(-32, -21)

@@ -1,7 +1,7 @@
 """A ball rolls down a ramp and strikes a block, which slides on with its momentum; the question is whether the block
 reaches the coloured zone at the end of the deck.
 
-Control: deck and zone are in view. Void: the panel stands before them; the ball is seen to roll in behind it.
+Control: deck and zone are in view. Void: the occluder stands before them; the ball is seen to roll in behind it.
 Hidden element: the board between block and zone, which is slick or rough. The ramp ends in a step, so that nothing
 that happens on the deck comes back out.
 """

@@ -1,7 +1,7 @@
 """A ball rolls down a covered ramp into a forked tunnel; the question is by which exit it comes out.
 
-Control: both exits and the tray at each of them are in view. Void: the panel stands before the fork and the trays; the
-ramp is seen above it.
+Control: both exits and the tray at each of them are in view. Void: the occluder stands before the fork and the trays;
+the ramp is seen above it.
 Hidden element: the deflector in the fork, which is turned to lead the ball to the left or to the right.
 """
 

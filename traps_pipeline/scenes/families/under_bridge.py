@@ -1,7 +1,7 @@
 """A ball rolls down a ramp on to a road that leads under a footbridge; does it come out at the other end?
 
-Control: the road under the bridge and beyond is in view. Void: the panel stands before the far half of the bridge and
-the road beyond.
+Control: the road under the bridge and beyond is in view. Void: the occluder stands before the far half of the bridge
+and the road beyond.
 Hidden element: a kerb under the bridge, which lies across the road or along its far edge.
 """
 
@@ -44,7 +44,7 @@ class Params:
     bridge_m: float = between(0.40, 0.46)  # width of the bridge, along the road
     span_m: float = between(0.42, 0.50)  # length of the bridge, across the road
     height_m: float = between(0.22, 0.25)  # of the bridge's lower side
-    mouth_m: float = between(0.05, 0.08)  # part of the bridge that is seen beside the panel
+    mouth_m: float = between(0.05, 0.08)  # part of the bridge that is seen beside the occluder
     beyond_m: float = between(0.30, 0.38)  # road past the bridge
     hump_m: float = between(0.06, 0.09)  # how much higher its middle is
     planks: int = one_of(7, 9)

@@ -1,6 +1,6 @@
 """A ball strikes a wedge and pushes it along a track; the question is whether the wedge gets onto the mat.
 
-Control: track, wedge and mat are in view. Void: the panel stands before all of them but the ball's run-up.
+Control: track, wedge and mat are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: a strip of the track before the mat that is slippery or rough, or a stop that stands on the track or
 beside it.
 """
@@ -46,7 +46,7 @@ class Params:
     wedge_height_m: float = between(0.09, 0.11)
     radius_m: float = between(0.046, 0.054)
     speed_m_s: float = between(1.0, 1.25)
-    run_m: float = between(0.76, 0.86)  # visible track before the panel
+    run_m: float = between(0.76, 0.86)  # visible track before the occluder
     mat_m: float = drawn_by(lambda rng, so_far: so_far["wedge_length_m"] + uniform(rng, 0.10, 0.14))
     track_colour: str = one_of("wood", "grey", "white")
     azimuth_deg: float = facing(-16, 20)

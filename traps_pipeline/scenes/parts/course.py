@@ -39,7 +39,7 @@ Point = tuple[float, float]  # along, up (m)
 SHADOW_RIGHT = 0.35
 SHADOW_BACK = 0.55
 FLAG, FLAG_SHAPE = 0.065, 0.75  # width of a flag, as a share of what the camera shows; its height, of its width
-FLAG_CLEAR_M = 0.045  # over the line of sight past the panel, which itself stands out by a margin
+FLAG_CLEAR_M = 0.045  # over the line of sight past the occluder, which itself stands out by a margin
 MAST = (0.20, 0.20, 0.21, 1.0)  # neither black nor grey to an observer
 
 
@@ -333,8 +333,8 @@ class Course:
     # --- what stands for hidden things ---
 
     def mark(self, phrase: str, at: str | tuple[float, float], colour: str | None = None) -> None:
-        """Add a flag over the panel for what a question names and the panel hides. It is drawn only, and is the same
-        whatever the hidden element is: so it may stand only where something is in every world, or begins.
+        """Add a flag over the occluder for what a question names and the occluder hides. It is drawn only, and is the
+        same whatever the hidden element is: so it may stand only where something is in every world, or begins.
 
         at: the geom, or the body at its start, behind which it stands, or a place (along, across). colour: None takes
         that geom's.
@@ -353,7 +353,7 @@ class Course:
     def _raise_flags(self, p: Any, cover: Box, in_view: Sequence[Box]) -> list[Box]:
         """Draw the flags of all marks; returns what the camera must see of them.
 
-        A line of sight over the panel falls as it goes back: it meets the upper edges of `cover`, and the flag flies
+        A line of sight over the occluder falls as it goes back: it meets the upper edges of `cover`, and the flag flies
         where it passes over the mark. Flags side by side fly at different heights.
         """
         azimuth, down = np.radians(p.azimuth_deg), np.radians(-p.elevation_deg)
@@ -398,7 +398,7 @@ class Course:
         (x, y, z), reach, half_high = (float(value) for value in centre), size[0] / 2, size[1] / 2
         return Box((x - reach, y - reach, z - half_high), (x + reach, y + reach, z + half_high))
 
-    # --- what panel and camera must reach ---
+    # --- what occluder and camera must reach ---
 
     def box(self, along: Span, across: Span, up: Span, *, left: float = 0.0, right: float = 0.0) -> Box:
         """Return a box in the world. left, right: how much longer (m) it is at its left and right end in the picture,
@@ -413,7 +413,7 @@ class Course:
         return length if self.direction > 0 else 0.0
 
     def cover(self, along: Span, across: Span, high: float) -> Box:
-        """Return what the panel must hide of things that are up to `high`, their shadows included."""
+        """Return what the occluder must hide of things that are up to `high`, their shadows included."""
         right = SHADOW_RIGHT * high if self.direction > 0 else 0.01
         return self.box(along, (across[0], across[1] + SHADOW_BACK * high), (0, high), left=0.01, right=right)
 

@@ -1,8 +1,8 @@
 """Two rows of dominoes with a hand-off between them, such that nothing of the second row pushes back on the first.
 
 A rolling ball sets off the first row, which is in view. Its last domino only kicks a second ball, which is behind the
-panel from the start and which two posts stop after it has struck the second row. Lengths are in domino heights unless a
-name ends in `_m`; they run along the way from the first domino on.
+occluder from the start and which two posts stop after it has struck the second row. Lengths are in domino heights
+unless a name ends in `_m`; they run along the way from the first domino on.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def add_domino(course: Course, size: Size, domino: Standing, row_at: float) -> N
 
 
 def cover(course: Course, size: Size, along: Span, back: float) -> Box:
-    """Return what the panel must hide of the covered part, which reaches to the back by so many heights; whatever a gap
-    changes casts its shadow behind the panel too."""
+    """Return what the occluder must hide of the covered part, which reaches to the back by so many heights; whatever a
+    gap changes casts its shadow behind the occluder too."""
     h = size.height_m
     across = (-h * (size.width / 2 + 0.10), h * back)
     return course.box(along, across, (0, (PLANK + 1.04) * h), right=course.ahead(SHADOW_RIGHT * h))

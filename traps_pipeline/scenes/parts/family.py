@@ -12,7 +12,7 @@ from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.look import OF_OCCLUSION, dressed, look_of, with_look
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.parts.vision import after_panel, before_panel, still, without_flags
+from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, still, without_flags
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
@@ -42,11 +42,11 @@ def scene_family(
     """Return a family from its parts; `kit.Family` says what the other fields mean.
 
     Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
-    chaotic family. observe: what is seen of the outcome. foresee: what follows from the frames before a panel, where
-    one comes before the outcome. look: what the end alone tells, where a panel hid the beginning and went. twins: other
-    worlds than those, for a hidden element that is more than one field. sub_scenario: the family's name unless it is
-    given. looks: parts of the look that vary; unless they are given, all but the size in an occlusion family, and none
-    in a chaotic one.
+    chaotic family. observe: what is seen of the outcome. foresee: what follows from the frames before an occluder,
+    where one comes before the outcome. look: what the end alone tells, where an occluder hid the beginning and went.
+    twins: other worlds than those, for a hidden element that is more than one field. sub_scenario: the family's name
+    unless it is given. looks: parts of the look that vary; unless they are given, all but the size in an occlusion
+    family, and none in a chaotic one.
     """
     if twins is None and vary.hidden_field(params) is not None:
         twins = vary.twins
@@ -57,13 +57,13 @@ def scene_family(
             return None
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
-        shown = before_panel(frames)  # what a panel covers at the end was seen before it came
+        shown = before_occluder(frames)  # what an occluder covers at the end was seen before it came
         unflagged = shown if twins is None else without_flags(shown)
         if foresee is not None and len(shown) < len(frames):
-            at_rest = still(shown) or still(shown[:-1])  # the shadow of a panel may come before it does
+            at_rest = still(shown) or still(shown[:-1])  # the shadow of an occluder may come before it does
             return _first(unflagged, named, (observe, foresee) if at_rest else (foresee, observe))
         answer = observe(unflagged, named)
-        if answer is None and look is not None and len(end := after_panel(unflagged)) < len(unflagged):
+        if answer is None and look is not None and len(end := after_occluder(unflagged)) < len(unflagged):
             return look(end, named)
         return answer
 

@@ -45,7 +45,7 @@ def dependence(family: Family) -> str | None:
 
 
 def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
-    """Return a scene and its twins, their twins and so on, each once: all that may be behind the panel."""
+    """Return a scene and its twins, their twins and so on, each once: all that may be behind the occluder."""
     assert family.twins is not None
     worlds, waiting = [], [params]
     while waiting and len(worlds) < MOST_WORLDS:

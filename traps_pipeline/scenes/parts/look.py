@@ -1,7 +1,7 @@
-"""How a scene looks, beside what happens in it: floor, light, the panel's colour, what stands behind it, the camera.
+"""How a scene looks, beside what happens in it: floor, light, the occluder's colour, what stands behind it, the camera.
 
 A look is a value that is drawn with a scenario and stored with its parameters, as `look`; a record without one looks as
-scenes did before there were looks. It touches nothing that moves, so the trajectory is the same; camera, panel and
+scenes did before there were looks. It touches nothing that moves, so the trajectory is the same; camera, occluder and
 certificates are computed under it like everything else.
 """
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 # What may vary, as `traps benchmark sample --look` names it.
 PARTS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 OF_OCCLUSION = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
-# Colours of the panel (sRGB): dark, dull, and none that a question names or that is taken for one in another light.
-PANELS: Mapping[str, tuple[float, float, float]] = {
+# Colours of the occluder (sRGB): dark, dull, and none that a question names or that is taken for one in another light.
+OCCLUDERS: Mapping[str, tuple[float, float, float]] = {
     "navy": COLOURS["navy"],
     "maroon": (0.30, 0.16, 0.18),
     "olive": (0.29, 0.29, 0.18),
     "petrol": (0.13, 0.22, 0.24),
     "umber": (0.27, 0.22, 0.18),
 }
-# What the panel is of, besides its colour: thin lines, paler by so much, at so many to the metre and so wide.
+# What the occluder is of, besides its colour: thin lines, paler by so much, at so many to the metre and so wide.
 MATERIALS = ("plain", "slats", "tiles")
 LINE_TONE, LINES_PER_M, LINE_SHARE = 1.6, 8.0, 0.08
 SIZES = {"360p": 1, "720p": 2}  # of a frame: how many times as fine as 480x360
@@ -48,9 +48,9 @@ class Look:
     """What a scene looks like. A field that is None or empty leaves things as they are without a look.
 
     floor_*: `parts.floor`. light_turn_deg: of the key light about the vertical; light: what its brightness is
-    multiplied by, RGB. panel: a name of `PANELS`. bystanders: (across, behind, half width, half height) in metres, from
-    the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up. material: of the
-    panel, of `MATERIALS`. size: of a frame, of `SIZES`.
+    multiplied by, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
+    from the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up. material: of
+    the occluder, of `MATERIALS`. size: of a frame, of `SIZES`.
     """
 
     floor_pattern: str | None = None
@@ -69,8 +69,8 @@ class Look:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> Look:
-        """Return the look in a record's parameters. Raises ValueError for an unknown field, tone, panel, material or
-        size."""
+        """Return the look in a record's parameters. Raises ValueError for an unknown field, tone, colour of the
+        occluder, material or size."""
         try:
             look = Look(**{name: _tuples(value) for name, value in record.items()})
         except TypeError as error:
@@ -78,8 +78,8 @@ class Look:
         for name in (*look.floor_tones, *look.bystander_tones):
             if name not in TONES:
                 raise ValueError(f"look: no tone {name!r}; there are {', '.join(TONES)}")
-        if look.panel not in (None, *PANELS):
-            raise ValueError(f"look: no panel {look.panel!r}; there are {', '.join(PANELS)}")
+        if look.panel not in (None, *OCCLUDERS):
+            raise ValueError(f"look: no panel {look.panel!r}; there are {', '.join(OCCLUDERS)}")
         for name, known in (("material", MATERIALS), ("size", SIZES)):
             if getattr(look, name) not in known:
                 raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(known)}")
@@ -104,7 +104,7 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
         drawn["light_turn_deg"] = uniform(rng, -15, 15)
         drawn["light"] = tuple(round(bright * (1 + tint), 3) for tint in (warm, 0.0, -warm))
     if "panel" in parts:
-        drawn["panel"] = str(rng.choice(list(PANELS)))
+        drawn["panel"] = str(rng.choice(list(OCCLUDERS)))
     if "bystanders" in parts:
         places = [
             (uniform(rng, -0.9, 0.9), uniform(rng, *BEHIND_M), uniform(rng, 0.04, 0.12), uniform(rng, 0.04, 0.2))
@@ -150,29 +150,29 @@ def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
     return WIDTH * fine, HEIGHT * fine
 
 
-def paint_panels(spec: mujoco.MjSpec, panels: Sequence[mujoco.MjsGeom], params: Any) -> None:
-    """Give panels of one size their colour and their material. What they are of is seen on them alone: they neither
+def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], params: Any) -> None:
+    """Give occluders of one size their colour and their material. What they are of is seen on them alone: they neither
     mirror nor let anything through."""
     import mujoco
 
     look = look_of(params)
-    colour = PANELS["navy" if look is None or look.panel is None else look.panel]
-    for geom in panels:
+    colour = OCCLUDERS["navy" if look is None or look.panel is None else look.panel]
+    for geom in occluders:
         geom.rgba = [*colour, 1.0]
     if look is None or look.material == "plain":
         return
     down, right = np.mgrid[:TEXELS, :TEXELS] / TEXELS
     line = (down < LINE_SHARE) | ((right < LINE_SHARE) & (look.material == "tiles"))
-    texture = spec.add_texture(name="panel", type=mujoco.mjtTexture.mjTEXTURE_2D)
+    texture = spec.add_texture(name="occluder", type=mujoco.mjtTexture.mjTEXTURE_2D)
     texture.width = texture.height = TEXELS
     texture.nchannel = 3
     tone = np.where(line[..., None], np.minimum(1.0, LINE_TONE * np.array(colour) + 0.06), np.array(colour))
     texture.data = np.rint(255 * tone).astype(np.uint8).tobytes()
-    material = spec.add_material(name="panel", specular=0.0, shininess=0.0, reflectance=0.0, rgba=[1, 1, 1, 1])
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "panel"
+    material = spec.add_material(name="occluder", specular=0.0, shininess=0.0, reflectance=0.0, rgba=[1, 1, 1, 1])
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "occluder"
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
-    for geom in panels:
-        geom.material, geom.rgba = "panel", [1, 1, 1, 1]
+    for geom in occluders:
+        geom.material, geom.rgba = "occluder", [1, 1, 1, 1]
         wide, thick, tall = (float(half) for half in geom.size)  # a texture lies in a box's own x and y: stand it up
         cos, _, _, sin = (float(part) for part in geom.quat)
         geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask, is_panel, largest, moved, track
+from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask, is_occluder, largest, moved, track
 from traps_pipeline.scenes.parts.wording import choices_in
 
 Observer = Callable[[np.ndarray, Mapping[str, str]], str | None]
@@ -61,7 +61,7 @@ def colours_of_balls(frames: np.ndarray, named: Mapping[str, str], pool: Sequenc
 
 
 def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
-    """Return the largest region of a colour that may be a ball: neither as large nor as rectangular as a panel.
+    """Return the largest region of a colour that may be a ball: neither as large nor as rectangular as an occluder.
 
     fill: greatest share of its bounding box. longer: how many times as long as it is wide, at most.
     """
@@ -200,7 +200,7 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path, box = track(frames, named[thing], 60), largest(frames[0], named[goal], 60)
         first, last = path[0], end_of(path, ahead)
-        if first is None or last is None or box is None or is_panel(last) or is_panel(box):
+        if first is None or last is None or box is None or is_occluder(last) or is_occluder(box):
             return None
         way = np.array([box.x, box.y]) - place(first)
         return "yes" if (place(last) - place(first)) @ way / (way @ way) > 0.6 else "no"
@@ -213,8 +213,8 @@ def has_fallen(thing: str) -> Observer:
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = track(frames, named[thing], 60)
-        if path[0] is None or is_panel(path[0]) or path[0].box[3] < path[0].box[2] or not at_rest(path):
-            return None  # neither a panel nor a flag stands like a domino
+        if path[0] is None or is_occluder(path[0]) or path[0].box[3] < path[0].box[2] or not at_rest(path):
+            return None  # neither an occluder nor a flag stands like a domino
         return "no" if upper_half_stays(frames, named[thing], path[0]) else "yes"
 
     return observe
@@ -226,7 +226,7 @@ def has_begun(thing: str, reach: float) -> Observer:
 
     def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         first, last = largest(frames[0], named[thing], 60), largest(frames[-1], named[thing], 60)
-        if first is None or last is None or is_panel(first):
+        if first is None or last is None or is_occluder(first):
             return None
         left = np.hypot(last.x - first.x, last.y - first.y) > BEGUN_PX or not upper_half_stays(
             frames, named[thing], first

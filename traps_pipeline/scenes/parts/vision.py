@@ -1,7 +1,7 @@
 """Classical vision for observers: where a colour is in a frame, and how it moves (OpenCV, no knowledge of the scene).
 
 Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
-`kit.COLOURS`. A colour that is none of them (most panels') belongs to no mask.
+`kit.COLOURS`. A colour that is none of them (most occluders') belongs to no mask.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.look import PANELS
+from traps_pipeline.scenes.parts.look import OCCLUDERS
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
-PANEL_PX = 7000  # a panel that comes before a scene is larger, whatever moves is smaller
+OCCLUDER_PX = 7000  # an occluder that comes before a scene is larger, whatever moves is smaller
 STEP_PX = 4000  # of it that come in one step
-COMING_PX = 600  # of a panel on its way, that are new in a frame
+COMING_PX = 600  # of an occluder on its way, that are new in a frame
 COMES_FRAMES = 4  # of five a second, in which it may be seen on its way
 EDGE = 60  # least contrast of an edge
 MOVED_PX = 24  # what moves changes more pixels from frame to frame
@@ -93,9 +93,9 @@ def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
 
 
 def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
-    """Return the largest region of a colour that cover panels have, in light or shade, with the lines on it."""
+    """Return the largest region of a colour that occluders have, in light or shade, with the lines on it."""
     pixels, mask = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
-    for named in PANELS.values():
+    for named in OCCLUDERS.values():
         colour = np.array(named, np.float32)
         bright = pixels @ colour / (colour @ colour)
         off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
@@ -124,12 +124,12 @@ def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int 
     return [largest(frame, colour, min_area) for frame in frames]
 
 
-def before_panel(frames: np.ndarray) -> np.ndarray:
-    """Return the frames before a panel comes that stands to the end of the clip; all of them if none comes.
+def before_occluder(frames: np.ndarray) -> np.ndarray:
+    """Return the frames before an occluder comes that stands to the end of the clip; all of them if none comes.
 
-    A panel comes in large steps: a large region turns to one colour (but for its shadow), which is not that of what is
-    around it, and soon a large region has that colour and keeps it. What stands from the first frame on does not come;
-    where a panel goes, the scene goes on.
+    An occluder comes in large steps: a large region turns to one colour (but for its shadow), which is not that of what
+    is around it, and soon a large region has that colour and keeps it. What stands from the first frame on does not
+    come; where an occluder goes, the scene goes on.
     """
     for at in range(1, len(frames)):
         changed = _apart(frames[at], frames[at - 1]) > CHANGED
@@ -158,11 +158,11 @@ def _stands_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
     closed = cv2.morphologyEx(
         stands.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
     )  # lines between slats
-    return bool(closed.sum() >= PANEL_PX and (soon_after & stands).sum() > 0.9 * stands.sum())
+    return bool(closed.sum() >= OCCLUDER_PX and (soon_after & stands).sum() > 0.9 * stands.sum())
 
 
 def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
-    """Return the first frame in which a panel of a colour is seen on its way, a large part of which comes in frame
+    """Return the first frame in which an occluder of a colour is seen on its way, a large part of which comes in frame
     `comes`."""
     first = comes
     while first > max(1, comes - COMES_FRAMES):
@@ -173,9 +173,9 @@ def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
     return first
 
 
-def after_panel(frames: np.ndarray) -> np.ndarray:
-    """Return the frames after a panel goes that stands from the first one on; all of them if none goes."""
-    return before_panel(frames[::-1])[::-1]
+def after_occluder(frames: np.ndarray) -> np.ndarray:
+    """Return the frames after an occluder goes that stands from the first one on; all of them if none goes."""
+    return before_occluder(frames[::-1])[::-1]
 
 
 def moved(frames: np.ndarray) -> np.ndarray:
@@ -267,6 +267,7 @@ def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.
     return max(xs) - min(xs) <= tolerance_px and max(ys) - min(ys) <= tolerance_px
 
 
-def is_panel(blob: Blob, longest_px: int = 130) -> bool:
-    """Return whether a region is too long for a thing of a tabletop scene, or so thin that only a panel's edge is."""
+def is_occluder(blob: Blob, longest_px: int = 130) -> bool:
+    """Return whether a region is too long for a thing of a tabletop scene, or so thin that only an occluder's edge
+    is."""
     return max(blob.box[2:]) > longest_px or min(blob.box[2:]) < 5

@@ -22,7 +22,7 @@ Vec3 = tuple[float, float, float]
 Taxonomy = Literal["occlusion", "chaotic"]
 AnswerType = Literal["binary", "direction", "colour", "count_range", "numeric"]
 
-# The six answer colours are saturated and far apart; navy is kept for the cover panel alone.
+# The six answer colours are saturated and far apart; navy is kept for the occluder alone.
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "red": (0.86, 0.10, 0.12),
     "green": (0.08, 0.62, 0.20),
@@ -39,7 +39,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
 }
 
 READ = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
-PANEL_GROUP = 4  # geoms of the cover panel: drawn in the void only, collide with nothing
+OCCLUDER_GROUP = 4  # geoms of the occluder: drawn in the void only, collide with nothing
 COMING_GROUP = 2  # the board that comes before a scene, until it stands
 FLOOR_GROUP = 3  # planes, while they are drawn
 REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
@@ -120,13 +120,13 @@ class Scene:
 
     decisive: bodies whose end state is the outcome; in frame throughout, invisible in an occlusion void from hiding on.
     hidden: geoms of the hidden element (occlusion), never visible in the void.
-    cover: what the cover panel may hide: everything decisive from hiding on, and the hidden element (occlusion). It is
+    cover: what the occluder may hide: everything decisive from hiding on, and the hidden element (occlusion). It is
         cut to what the twin needs.
     framed: boxes that must lie in frame besides everything that moves (the outcome zone above all).
     velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body); of soft bodies linear.
     inventory: what a viewer can name.
-    rest: where all outcomes lie (chaotic), which a panel hides that closes the control; None: all of the stage.
-    marks: phrases ('left bin') of which a flag stands over the panel; its geom is `flag_of(phrase)`.
+    rest: where all outcomes lie (chaotic), which an occluder hides that closes the control; None: all of the stage.
+    marks: phrases ('left bin') of which a flag stands over the occluder; its geom is `flag_of(phrase)`.
     shown_by: of a noun that no geom's name begins with: the nouns that stand for it.
     """
 
@@ -374,7 +374,7 @@ def uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return round(float(rng.uniform(low, high)), 4)
 
 
-# Pairs that a viewer may take for each other in shade, or that lean towards the navy of the panel.
+# Pairs that a viewer may take for each other in shade, or that lean towards the navy of the occluder.
 _LOOK_ALIKE = (
     {"red", "orange"},
     {"orange", "yellow"},

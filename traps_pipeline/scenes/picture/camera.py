@@ -1,4 +1,4 @@
-"""Where the camera stands and where the cover panel stands: both fitted, neither placed by hand."""
+"""Where the camera stands and where the occluder stands: both fitted, neither placed by hand."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from traps_pipeline.scenes.physics.kit import Box, Vec3, View
 
 WIDTH, HEIGHT = 480, 360
 FRAME_FILL = 0.92  # share of the half-frame that the fitted points may use
-PANEL_MARGIN = 0.03  # the panel reaches this much (m) beyond what it must hide, as seen from the camera
-PANEL_GAP = 0.02  # distance (m) between the panel and the nearest point that it hides
-PANEL_HALF_THICKNESS = 0.006
+OCCLUDER_MARGIN = 0.03  # the occluder reaches this much (m) beyond what it must hide, as seen from the camera
+OCCLUDER_GAP = 0.02  # distance (m) between the occluder and the nearest point that it hides
+OCCLUDER_HALF_THICKNESS = 0.006
 
 
 @dataclass(frozen=True)
@@ -56,17 +56,17 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Panel:
-    """The cover panel: an opaque upright box facing the camera. half: across, thickness, up (m)."""
+class Occluder:
+    """The occluder: an opaque upright box facing the camera. half: across, thickness, up (m)."""
 
     centre: Vec3
     half: Vec3
     yaw_deg: float
 
     @staticmethod
-    def from_record(record: Mapping[str, Any]) -> Panel:
-        """Return the panel of a stored spec."""
-        return Panel(**_tuples(record))
+    def from_record(record: Mapping[str, Any]) -> Occluder:
+        """Return the occluder of a stored spec."""
+        return Occluder(**_tuples(record))
 
     def corners(self) -> np.ndarray:
         """Return the eight corners in the world, shape (8, 3)."""
@@ -77,11 +77,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class Closing:
-    """How a control ends: from this frame on a panel stands before its outcome, in an occlusion scene that of its void,
-    where the void has it."""
+    """How a control ends: from this frame on an occluder stands before its outcome, in an occlusion scene that of its
+    void, where the void has it."""
 
     frame: int
-    panel: Panel
+    occluder: Occluder
 
 
 def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -125,8 +125,8 @@ def fit_camera(view: View, points: np.ndarray) -> Camera:
     )
 
 
-def fit_panel(camera: Camera, cover: Box) -> Panel:
-    """Return the smallest upright panel on the floor, just in front of `cover`, that hides all of it from the
+def fit_occluder(camera: Camera, cover: Box) -> Occluder:
+    """Return the smallest upright occluder on the floor, just in front of `cover`, that hides all of it from the
     camera.
     """
     eye = camera.position()
@@ -134,31 +134,31 @@ def fit_panel(camera: Camera, cover: Box) -> Panel:
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     corners = cover.corners()
-    front = float((corners @ ahead).min()) - PANEL_GAP - 2 * PANEL_HALF_THICKNESS
+    front = float((corners @ ahead).min()) - OCCLUDER_GAP - 2 * OCCLUDER_HALF_THICKNESS
     reach = (corners - eye) @ ahead
     on_plane = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
     side = on_plane @ across
-    low, high = float(side.min()) - PANEL_MARGIN, float(side.max()) + PANEL_MARGIN
-    top = float(on_plane[:, 2].max()) + PANEL_MARGIN
-    centre = across * (low + high) / 2 + ahead * (front + PANEL_HALF_THICKNESS) + np.array([0, 0, top / 2])
-    return Panel(
+    low, high = float(side.min()) - OCCLUDER_MARGIN, float(side.max()) + OCCLUDER_MARGIN
+    top = float(on_plane[:, 2].max()) + OCCLUDER_MARGIN
+    centre = across * (low + high) / 2 + ahead * (front + OCCLUDER_HALF_THICKNESS) + np.array([0, 0, top / 2])
+    return Occluder(
         centre=_vec(centre),
-        half=(round((high - low) / 2, 6), PANEL_HALF_THICKNESS, round(top / 2, 6)),
+        half=(round((high - low) / 2, 6), OCCLUDER_HALF_THICKNESS, round(top / 2, 6)),
         yaw_deg=camera.azimuth_deg - 90.0,
     )
 
 
-def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Panel | None]:
-    """Return camera and panel together: the panel is placed by the camera, and the camera must have the panel in
-    frame.
+def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Occluder | None]:
+    """Return camera and occluder together: the occluder is placed by the camera, and the camera must have the occluder
+    in frame.
     """
-    camera, panel = fit_camera(view, points), None
+    camera, occluder = fit_camera(view, points), None
     if cover is None:
         return camera, None
     for _ in range(12):
-        panel = fit_panel(camera, cover)
-        camera = fit_camera(view, np.concatenate([points, panel.corners()]))
-    return camera, fit_panel(camera, cover)
+        occluder = fit_occluder(camera, cover)
+        camera = fit_camera(view, np.concatenate([points, occluder.corners()]))
+    return camera, fit_occluder(camera, cover)
 
 
 def in_frame(camera: Camera, points: np.ndarray) -> bool:

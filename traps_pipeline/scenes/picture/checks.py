@@ -1,4 +1,4 @@
-"""Pixel evidence: what is seen of a geom, what is seen past a panel, whether two worlds give one video."""
+"""Pixel evidence: what is seen of a geom, what is seen past an occluder, whether two worlds give one video."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Panel
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Occluder
 from traps_pipeline.scenes.picture.coming_board import LANDED, Coming
 from traps_pipeline.scenes.picture.render import Renderer
 
@@ -27,8 +27,8 @@ def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[t
 
 
 @dataclass(frozen=True)
-class PastPanel:
-    """What is seen past the panel in frames of a void: pixels (F,) of the decisive bodies, and of the hidden
+class PastOccluder:
+    """What is seen past the occluder in frames of a void: pixels (F,) of the decisive bodies, and of the hidden
     element."""
 
     decisive: np.ndarray
@@ -40,16 +40,17 @@ class PastPanel:
         return int(showing[-1]) + 1 if showing.size else 0
 
     def leaked(self, first: int) -> float:
-        """Return pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the panel
+        """Return pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the occluder
         hides.
         """
         return float(self.decisive[first:].sum() + self.hidden.sum())
 
 
-def past_panel(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastPanel:
-    """Return what is seen past the panel of the geoms of decisive bodies and of the hidden element, by segmentation."""
-    counts = renderer.visible_pixels(qpos, [*decisive, *hidden], panel=True)
-    return PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
+def past_occluder(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastOccluder:
+    """Return what is seen past the occluder of the geoms of decisive bodies and of the hidden element, by
+    segmentation."""
+    counts = renderer.visible_pixels(qpos, [*decisive, *hidden], occluder=True)
+    return PastOccluder(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
 def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
@@ -63,13 +64,13 @@ def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step
     return int((moves & visible[1:] & visible[:-1]).sum())
 
 
-def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> float:
-    """Return share of the picture's pixels over which anything moves that the panel covers. swept: corners (8, 3) of
+def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder) -> float:
+    """Return share of the picture's pixels over which anything moves that the occluder covers. swept: corners (8, 3) of
     every moving geom's box in every frame."""
     import cv2
 
     moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
-    for mask, solids in ((moving, swept), (board, [panel.corners()])):
+    for mask, solids in ((moving, swept), (board, [occluder.corners()])):
         for corners in solids:
             outline = cv2.convexHull(camera.project(corners).round().astype(np.int32))
             cv2.fillConvexPoly(mask, outline, 1)
@@ -78,17 +79,19 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> f
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
     """Yield the void that a trajectory makes, without the geoms that are named."""
-    yield from renderer.frames(qpos, panel=True, without=without)
+    yield from renderer.frames(qpos, occluder=True, without=without)
 
 
-def closing_frames(renderer: Renderer, qpos: np.ndarray, board: Coming, *, panel: bool = False) -> Iterator[np.ndarray]:
-    """Draw what a trajectory (F, nq) makes of a control, or of a void, whose panel stands from the start.
+def closing_frames(
+    renderer: Renderer, qpos: np.ndarray, board: Coming, *, occluder: bool = False
+) -> Iterator[np.ndarray]:
+    """Draw what a trajectory (F, nq) makes of a control, or of a void, whose occluder stands from the start.
 
     board: of each row, where the board is that closes it; once it stands it is drawn in the place of the void's own.
     """
     for row, offset in zip(qpos, board, strict=True):
         stands = offset == LANDED
-        yield from renderer.frames([row], panel=panel or stands, board=None if stands else offset)
+        yield from renderer.frames([row], occluder=occluder or stands, board=None if stands else offset)
 
 
 def ablation_pixels(

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Panel
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Occluder
 
 FASTER_M_S2 = 9.81  # as things fall; a board that slides in gains speed like one
 STEEP_DEG = 45.0  # a camera that looks down by more
@@ -28,8 +28,8 @@ def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: fl
     """Return where the board is in every frame of a control or void that it closes."""
     if closing is None:
         return [None] * n_frames
-    way = _way(closing.panel, camera)
-    distance = _out_of_picture_m(closing.panel, camera, way)
+    way = _way(closing.occluder, camera)
+    distance = _out_of_picture_m(closing.occluder, camera, way)
     speed = math.sqrt(2 * FASTER_M_S2 * distance)  # m/s, as it lands
 
     def offset(left_s: float) -> Offset | None:
@@ -41,23 +41,23 @@ def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: fl
     return [LANDED if i >= closing.frame else offset((closing.frame - i) / fps) for i in range(n_frames)]
 
 
-def before_board(panel: Panel) -> np.ndarray:
+def before_board(occluder: Occluder) -> np.ndarray:
     """Return where a coming board is beside a standing one: just in front of it, towards the camera (m)."""
-    azimuth = math.radians(panel.yaw_deg + 90.0)
-    return -(2 * panel.half[1] + IN_FRONT_M) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    azimuth = math.radians(occluder.yaw_deg + 90.0)
+    return -(2 * occluder.half[1] + IN_FRONT_M) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
 
 
-def _way(panel: Panel, camera: Camera) -> np.ndarray:
+def _way(occluder: Occluder, camera: Camera) -> np.ndarray:
     """Return the unit vector from a board's place towards where it comes from: up, or to its side of the picture."""
     if camera.elevation_deg >= -STEEP_DEG:
         return np.array([0.0, 0.0, 1.0])
     right = camera.axes()[0]
-    return right if camera.project(np.array(panel.centre))[0, 0] >= WIDTH / 2 else -right
+    return right if camera.project(np.array(occluder.centre))[0, 0] >= WIDTH / 2 else -right
 
 
-def _out_of_picture_m(panel: Panel, camera: Camera, way: np.ndarray) -> float:
+def _out_of_picture_m(occluder: Occluder, camera: Camera, way: np.ndarray) -> float:
     """Return how far along its way a board is wholly out of the picture."""
-    corners = panel.corners() + before_board(panel)
+    corners = occluder.corners() + before_board(occluder)
     for distance in np.arange(0.0, FURTHEST_M, STEP_M):
         x, y = camera.project(corners + distance * way).T
         if (x < 0).all() or (x > WIDTH).all() or (y < 0).all() or (y > HEIGHT).all():

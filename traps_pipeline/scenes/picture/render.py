@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.scenes.physics.flexes import flexes
-from traps_pipeline.scenes.physics.kit import COMING_GROUP, FLOOR_GROUP, PANEL_GROUP, REMOVED_GROUP
+from traps_pipeline.scenes.physics.kit import COMING_GROUP, FLOOR_GROUP, OCCLUDER_GROUP, REMOVED_GROUP
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera
 from traps_pipeline.scenes.picture.coming_board import Offset
 
@@ -122,7 +122,7 @@ class Renderer:
         self._camera.distance = camera.distance
         self._camera.azimuth, self._camera.elevation = camera.azimuth_deg, camera.elevation_deg
         _renderer_open = True
-        self._draw(model.qpos0, panel=True, without=())
+        self._draw(model.qpos0, occluder=True, without=())
         self._drawn = None  # a first picture differs from later ones, in single pixels
 
     def __enter__(self) -> Renderer:
@@ -138,7 +138,7 @@ class Renderer:
         self,
         qpos: Sequence[np.ndarray] | np.ndarray,
         *,
-        panel: bool = False,
+        occluder: bool = False,
         without: Sequence[str] = (),
         board: Offset | None = None,
     ) -> Iterator[np.ndarray]:
@@ -148,12 +148,12 @@ class Renderer:
 
         for row in qpos:
             self._put_board(board)
-            raw = self._draw(row, panel=panel, without=without)
+            raw = self._draw(row, occluder=occluder, without=without)
             small = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
             yield cv2.flip(cv2.cvtColor(small, cv2.COLOR_RGBA2RGB), 0)
 
     def visible_pixels(
-        self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, panel: bool = False
+        self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, occluder: bool = False
     ) -> np.ndarray:
         """Return how many pixels (of the 480x360 frame, so quarters occur) each geom or soft body has in each frame,
         shape (F, G)."""
@@ -167,7 +167,7 @@ class Renderer:
         try:
             self._put_board(None)
             for i, row in enumerate(qpos):
-                rgba = self._draw(row, panel=panel, without=())
+                rgba = self._draw(row, occluder=occluder, without=())
                 pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
                 shapes = self._scene.geoms[: self._scene.ngeom]
                 drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
@@ -183,7 +183,7 @@ class Renderer:
         if self._boards.size:
             self._model.geom_pos[self._boards] = self._board_places + np.array(offset or (0.0, 0.0, 0.0))
 
-    def _draw(self, qpos: np.ndarray, *, panel: bool, without: Sequence[str]) -> np.ndarray:
+    def _draw(self, qpos: np.ndarray, *, occluder: bool, without: Sequence[str]) -> np.ndarray:
         """Return the picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn
         again while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves
         is taken away. (The model does not change while it is drawn, but for the board that comes.)"""
@@ -191,13 +191,13 @@ class Renderer:
 
         self._data.qpos[:] = qpos
         self._place()
-        state = (*self._places(panel, without), panel, self._comes, tuple(without), self._scene.flags.tobytes())
+        state = (*self._places(occluder, without), occluder, self._comes, tuple(without), self._scene.flags.tobytes())
         if state == self._drawn:
             return self._pixels
         self._drawn = None
         option = mujoco.MjvOption()
         option.geomgroup[:] = 1
-        option.geomgroup[PANEL_GROUP], option.geomgroup[COMING_GROUP] = int(panel), int(self._comes)
+        option.geomgroup[OCCLUDER_GROUP], option.geomgroup[COMING_GROUP] = int(occluder), int(self._comes)
         option.geomgroup[FLOOR_GROUP] = option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
         everything, unmoved = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvPerturb()
         groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
@@ -239,13 +239,13 @@ class Renderer:
         """Return of a geom, or of a soft body."""
         return self._soft[name] if self._is_soft(name) else self._model.geom(name).id
 
-    def _places(self, panel: bool, without: Sequence[str]) -> tuple[bytes, ...]:
+    def _places(self, occluder: bool, without: Sequence[str]) -> tuple[bytes, ...]:
         """Return where everything is that is shown, to the last bit, and the lights. In a model with other things than
         geoms the whole pose stands for them."""
         model, data = self._model, self._data
         gone = [self._number(name) for name in without if not self._is_soft(name)]
         groups = model.geom_group
-        drawn = (groups != REMOVED_GROUP) & ((groups != PANEL_GROUP) | panel)
+        drawn = (groups != REMOVED_GROUP) & ((groups != OCCLUDER_GROUP) | occluder)
         drawn &= (groups != COMING_GROUP) | self._comes
         drawn[gone] = False
         places = (data.geom_xpos[drawn], data.geom_xmat[drawn], data.light_xpos, data.light_xdir)

@@ -1,9 +1,10 @@
 """Arms: further clips and questions of a scenario, each of which takes one shortcut away (docs/arms.md).
 
-A shortcut tells control from void without looking at what happens: a panel in the first frame, a short clip, the words
-of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be answered
-can be answered, and what must be abstained on cannot. Not every scenario admits every arm; `Rejected` says why. What
-an arm shows of a control it shows as if no panel closed it: it differs from the pair in what it takes away.
+A shortcut tells control from void without looking at what happens: an occluder in the first frame, a short clip, the
+words of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be
+answered can be answered, and what must be abstained on cannot. Not every scenario admits every arm; `Rejected` says
+why. What an arm shows of a control it shows as if no occluder closed it: it differs from the pair in what it takes
+away.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from traps_pipeline.scenes.parts.wording import false_premise
 from traps_pipeline.scenes.physics.kit import View
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import PANEL_HALF_THICKNESS, Panel, fit_camera
+from traps_pipeline.scenes.picture.camera import OCCLUDER_HALF_THICKNESS, Occluder, fit_camera
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms
 from traps_pipeline.scenes.worlds.shot import shown_points
@@ -34,10 +35,10 @@ from traps_pipeline.scenes.worlds.world import World
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
-SHOWN_AGAIN_S = 1.0  # before the end the panel of `removed` goes
+SHOWN_AGAIN_S = 1.0  # before the end the occluder of `removed` goes
 SEEN_PX = 150.0  # of what must be seen of a moving thing, or must differ between two worlds, in one sampled frame
-PANEL_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
-EARLIEST_COVER_S = 0.5  # the late panel comes no earlier
+OCCLUDER_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
+EARLIEST_COVER_S = 0.5  # the late occluder comes no earlier
 AGREE_SHARE = 0.95  # of the futures of a predictable cut
 FUTURES = 64  # of the last frame that it shows
 LEADS = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
@@ -64,7 +65,7 @@ class Scenario:
 
     @cached_property
     def control_frames(self) -> list[np.ndarray]:
-        """The control as it is drawn without the panel that may close it."""
+        """The control as it is drawn without the occluder that may close it."""
         with self.control.renderer() as renderer:
             return list(renderer.frames(self.control.qpos))
 
@@ -76,8 +77,8 @@ class Scenario:
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The void: with its panel, or up to its cut."""
-        if self.control.panel is not None:
+        """The void: with its occluder, or up to its cut."""
+        if self.control.occluder is not None:
             return self.control.void_frames
         return self.control_frames[: self.spec.void["cut_frame"]]
 
@@ -131,29 +132,29 @@ def must_answer(spec: SceneSpec) -> list[Question]:
     return [Question("control", spec.question, spec.ground_truth)]
 
 
-# --- a panel that hides nothing, or not for good ----------------------------------------------------------------------
+# --- an occluder that hides nothing, or not for good ------------------------------------------------------------------
 
 
-def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Panel]:
-    """Yield places for the void's own panel where it may hide nothing: behind everything, then beside it."""
-    panel, control = scenario.control.panel, scenario.control
-    assert panel is not None, "an occlusion scenario has a panel"
+def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Occluder]:
+    """Yield places for the void's own occluder where it may hide nothing: behind everything, then beside it."""
+    occluder, control = scenario.control.occluder, scenario.control
+    assert occluder is not None, "an occlusion scenario has an occluder"
     azimuth = np.radians(control.camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    centre, half = np.array(panel.centre), panel.half[0]
+    centre, half = np.array(occluder.centre), occluder.half[0]
     low, high = float((points @ across).min()), float((points @ across).max())
-    behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + PANEL_HALF_THICKNESS
+    behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
     at = float(centre @ across)
     for aside in (0.0, high - at, low - at):
-        yield _moved(panel, ahead * behind + across * aside)
+        yield _moved(occluder, ahead * behind + across * aside)
     for aside in (high + half + BEHIND_M - at, low - half - BEHIND_M - at):
-        yield _moved(panel, across * aside)
+        yield _moved(occluder, across * aside)
 
 
-def _moved(panel: Panel, by: np.ndarray) -> Panel:
-    x, y, z = (round(float(value), 6) for value in np.array(panel.centre) + by)
-    return replace(panel, centre=(x, y, z))
+def _moved(occluder: Occluder, by: np.ndarray) -> Occluder:
+    x, y, z = (round(float(value), 6) for value in np.array(occluder.centre) + by)
+    return replace(occluder, centre=(x, y, z))
 
 
 def _decoy(scenario: Scenario) -> Take:
@@ -161,26 +162,26 @@ def _decoy(scenario: Scenario) -> Take:
     points = shown_points(control.model, control.scene, control.qpos)
     view = View(control.camera.azimuth_deg, control.camera.elevation_deg, control.camera.fovy_deg)
     reason = ""
-    for panel in _decoys(scenario, points):
-        camera = fit_camera(view, np.concatenate([points, panel.corners()]))
-        model, scene = compile_scene(control.family, control.params, control.physics, panel)
+    for occluder in _decoys(scenario, points):
+        camera = fit_camera(view, np.concatenate([points, occluder.corners()]))
+        model, scene = compile_scene(control.family, control.params, control.physics, occluder)
         geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
         groups = legible_groups(control.family, model, scene, control.motion, control.params)
         sampled = control.qpos[scenario.sampled]
         with Renderer(model, camera) as renderer:
-            shown = float(renderer.visible_pixels(sampled[:1], ["cover_panel"], panel=True)[0, 0])
-            without, beside = (renderer.visible_pixels(sampled, geoms, panel=there) for there in (False, True))
+            shown = float(renderer.visible_pixels(sampled[:1], ["occluder"], occluder=True)[0, 0])
+            without, beside = (renderer.visible_pixels(sampled, geoms, occluder=there) for there in (False, True))
             hidden = float(np.abs(without - beside).sum())
             least = checks.least_visible(renderer, sampled[-3:], groups)
             small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
-            if shown < PANEL_PX or hidden or small:
+            if shown < OCCLUDER_PX or hidden or small:
                 reason = (
                     f"the decoy shows {shown:.0f} pixels, hides {hidden:.0f}, leaves {small or 'enough'} to be seen"
                 )
                 continue
-            evidence = {"panel_px": shown, "hides_px": hidden, "least_visible_px": min(least), "panel": vars(panel)}
-            return Take(list(renderer.frames(control.qpos, panel=True)), evidence)
-    raise Rejected(f"{spec.scenario_id}: no place for a panel that hides nothing ({reason})")
+            evidence = {"panel_px": shown, "hides_px": hidden, "least_visible_px": min(least), "panel": vars(occluder)}
+            return Take(list(renderer.frames(control.qpos, occluder=True)), evidence)
+    raise Rejected(f"{spec.scenario_id}: no place for an occluder that hides nothing ({reason})")
 
 
 def _removed(scenario: Scenario) -> Take:
@@ -188,16 +189,16 @@ def _removed(scenario: Scenario) -> Take:
     commit = scenario.control.outcome.commit_frame
     last_seen = checks.last_sampled(len(scenario.control.qpos), scenario.fps)[0]
     if spec.void["hidden_from_frame"] >= at or commit > last_seen or last_seen < at:
-        raise Rejected("the outcome is not both hidden before the panel goes and settled after it")
+        raise Rejected("the outcome is not both hidden before the occluder goes and settled after it")
     order = scenario.control.outcome.in_order
     if order is not None and order[0] < at:
-        raise Rejected("the first of the two events that are asked about happens behind the panel")
+        raise Rejected("the first of the two events that are asked about happens behind the occluder")
     frames = [*scenario.void_frames[:at], *scenario.control_frames[at:]]
     return Take(frames, {"hidden_until_s": at / scenario.fps, "settled_s": commit / scenario.fps})
 
 
-def _late_panel(scenario: Scenario) -> Take:
-    """Return the panel comes in the last frame before the outcome is settled."""
+def _late_occluder(scenario: Scenario) -> Take:
+    """Return the occluder comes in the last frame before the outcome is settled."""
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
@@ -205,7 +206,9 @@ def _late_panel(scenario: Scenario) -> Take:
     pairs = zip(scenario.control_frames[before], scenario.twin_frames[before], strict=True)
     differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
     if differing < SEEN_PX:
-        raise Rejected(f"before the panel comes the two worlds differ in {differing} pixels, {SEEN_PX:.0f} are wanted")
+        raise Rejected(
+            f"before the occluder comes the two worlds differ in {differing} pixels, {SEEN_PX:.0f} are wanted"
+        )
     frames = [*scenario.control_frames[:at], *scenario.void_frames[at:]]
     return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": differing})
 
@@ -335,27 +338,27 @@ ARMS: Mapping[str, Arm] = {
     for arm in (
         Arm(
             "decoy",
-            "a panel means: abstain",
-            f"the void's own panel stands behind or beside the scene with at least {PANEL_PX:.0f} pixels, takes no "
-            "pixel of a decisive body or the hidden element in any sampled frame, and the outcome stays legible",
+            "an occluder means: abstain",
+            f"the void's own occluder stands behind or beside the scene with at least {OCCLUDER_PX:.0f} pixels, takes "
+            "no pixel of a decisive body or the hidden element in any sampled frame, and the outcome stays legible",
             must_answer,
             _decoy,
         ),
         Arm(
             "removed",
-            "a panel in the first frames means: abstain",
-            f"the panel stands as in the void until {SHOWN_AGAIN_S} s before the end; the last three sampled frames "
+            "an occluder in the first frames means: abstain",
+            f"the occluder stands as in the void until {SHOWN_AGAIN_S} s before the end; the last three sampled frames "
             "are the control's, with the outcome settled; which of two events was first is not asked",
             must_answer,
             _removed,
         ),
         Arm(
-            "late_panel",
-            "a panel at the end means: abstain",
+            "late_occluder",
+            "an occluder at the end means: abstain",
             "up to the last frame before the outcome is settled the control is seen, and some sampled frame of it "
             f"differs from the other world's in at least {SEEN_PX:.0f} pixels, so that what follows can be inferred",
             must_answer,
-            _late_panel,
+            _late_occluder,
         ),
         Arm(
             "length_matched",

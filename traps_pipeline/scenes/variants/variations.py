@@ -1,8 +1,8 @@
 """Variations: the pairs with one thing changed, step by step, for what the paper supposes and did not measure.
 
 docs/hypotheses.md says what each is for. What varies the question or the way it is put shows the pair's own clips; what
-varies the panel is drawn and certified here. A panel that lets the outcome through makes no void, and is not asked as
-one. Not every scenario admits every variation; `Rejected` says why.
+varies the occluder is drawn and certified here. An occluder that lets the outcome through makes no void, and is not
+asked as one. Not every scenario admits every variation; `Rejected` says why.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.protocol.datasets import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
+from traps_pipeline.protocol.datasets import FRAMINGS, OCCLUDER_DOSES, OCCLUDER_LOOKS, SCHEMAS
 from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.wording import asked, choices_in
@@ -29,8 +29,8 @@ from traps_pipeline.video.policies import shown_at_end
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
-NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through a panel
-WIDER = 1.4  # by which the large panel is wider: a higher one would hide the flags of what the question names
+NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through an occluder
+WIDER = 1.4  # by which the large occluder is wider: a higher one would hide the flags of what the question names
 GREY, MAGENTA = (0.55, 0.55, 0.57), (1.0, 0.0, 1.0)  # a colour near the floor's; one that nothing in any scene has
 END_S = 0.5  # of the control's end, in which frames shown later must show the outcome
 PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colours that may be offered as answers
@@ -98,13 +98,13 @@ def _offered(scenario: Scenario) -> Take:
     return Take([], {"offered": [scenario.spec.ground_truth, scenario.spec.twin.ground_truth]})
 
 
-# --- the panel --------------------------------------------------------------------------------------------------------
+# --- the occluder -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a panel looks. colour: RGB in [0, 1], None for the panel's own; alpha: 1 is opaque; wide: in terms of its
-    own width."""
+    """How an occluder looks. colour: RGB in [0, 1], None for the occluder's own; alpha: 1 is opaque; wide: in terms of
+    its own width."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0
@@ -112,39 +112,42 @@ class Look:
 
 
 def _renderer(world: World, look: Look) -> Renderer:
-    """Return a renderer of a world whose panel has another look, from the pair's camera."""
-    assert world.panel is not None, "an occlusion scenario has a panel"
-    across, thickness, up = world.panel.half
-    panel = replace(world.panel, half=(round(across * look.wide, 6), thickness, up))
-    model, _ = compile_scene(world.family, world.params, world.physics, panel)
-    geom = model.geom("cover_panel")
+    """Return a renderer of a world whose occluder has another look, from the pair's camera."""
+    assert world.occluder is not None, "an occlusion scenario has an occluder"
+    across, thickness, up = world.occluder.half
+    occluder = replace(world.occluder, half=(round(across * look.wide, 6), thickness, up))
+    model, _ = compile_scene(world.family, world.params, world.physics, occluder)
+    geom = model.geom("occluder")
     if look.colour is not None:
-        geom.matid[:], geom.rgba[:3] = -1, look.colour  # of one colour, whatever the panel is of
+        geom.matid[:], geom.rgba[:3] = -1, look.colour  # of one colour, whatever the occluder is of
     geom.rgba[3] = look.alpha
     return Renderer(model, world.camera)
 
 
 def _void_with(scenario: Scenario, look: Look) -> Take:
-    """Return the void with another panel, if the other world gives the same frames byte for byte. Raises Rejected."""
+    """Return the void with another occluder, if the other world gives the same frames byte for byte. Raises
+    Rejected."""
     control, twin = scenario.control, scenario.twin
     moving = moving_geoms(control.model)
     with _renderer(control, look) as renderer:
         frames = list(checks.void_frames(renderer, control.qpos))
-        shown = float(renderer.visible_pixels(control.qpos[:1], ["cover_panel"], panel=True)[0, 0])
-        cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, panel=True).sum(axis=1).max())
+        shown = float(renderer.visible_pixels(control.qpos[:1], ["occluder"], occluder=True)[0, 0])
+        cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, occluder=True).sum(axis=1).max())
     with _renderer(twin, look) as renderer:
         differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
     if differing:
-        raise Rejected(f"behind this panel the two worlds differ in {differing} pixels, by {levels} levels at most")
+        raise Rejected(f"behind this occluder the two worlds differ in {differing} pixels, by {levels} levels at most")
     if cause < SEEN_PX:
-        raise Rejected(f"past this panel at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted")
+        raise Rejected(
+            f"past this occluder at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted"
+        )
     evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing}
     looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
 
 def _contrast(void: np.ndarray, control: np.ndarray) -> float:
-    """Return how far, in CIELAB, a panel is from what it covers: the mean over the pixels of a frame that it
+    """Return how far, in CIELAB, an occluder is from what it covers: the mean over the pixels of a frame that it
     changes.
     """
     import cv2
@@ -164,8 +167,8 @@ def _large(scenario: Scenario) -> Take:
 
 def _sheer(alpha: float) -> Callable[[Scenario], Take]:
     def film(scenario: Scenario) -> Take:
-        """Return a panel that lets light through, where it lets the outcome through: what tells the two worlds apart is
-        seen in the last sampled frames. Raises Rejected where it is not."""
+        """Return an occluder that lets light through, where it lets the outcome through: what tells the two worlds
+        apart is seen in the last sampled frames. Raises Rejected where it is not."""
         look, last = Look(alpha=alpha), checks.last_sampled(len(scenario.control.qpos), scenario.fps)
         with _renderer(scenario.control, look) as renderer:
             frames = list(checks.void_frames(renderer, scenario.control.qpos))
@@ -176,8 +179,8 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
         evidence = {"alpha": alpha, "seen_through_px": noticed, "levels": levels}
         if noticed < SEEN_PX:
             raise Rejected(
-                f"through a panel of alpha {alpha:g} the two worlds differ by {NOTICED} levels or more in {noticed} "
-                f"pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
+                f"through an occluder of alpha {alpha:g} the two worlds differ by {NOTICED} levels or more in "
+                f"{noticed} pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
             )
         return Take(frames, evidence)
 
@@ -188,8 +191,8 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
 
 
 def _later(scenario: Scenario) -> Take:
-    """Return the frames after those that models are shown at the end show the outcome too, but for those that a panel
-    closes; a void hides it in every frame."""
+    """Return the frames after those that models are shown at the end show the outcome too, but for those that an
+    occluder closes; a void hides it in every frame."""
     control = scenario.control
     at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
     shown = [frame + 1 for frame in at_end]
@@ -208,19 +211,19 @@ def _later(scenario: Scenario) -> Take:
 
 _SAME_VOID = (
     "the other world behind the void gives the same frames byte for byte, at every frame; at least "
-    f"{SEEN_PX:.0f} pixels of what moves are seen past the panel in some sampled frame"
+    f"{SEEN_PX:.0f} pixels of what moves are seen past the occluder in some sampled frame"
 )
 _SEEN_THROUGH = (
     f"not a void: in one of the last three sampled frames the two worlds differ by {NOTICED} of 255 levels or more in "
     f"at least {SEEN_PX:.0f} pixels"
 )
 _COUNTS = {"labels_two": 2, "labels_three": 3, "labels_six": 6}
-_COLOURED = {"panel_grey": GREY, "panel_magenta": MAGENTA}
-_ALPHAS = {name: int(name.removeprefix("panel_alpha_")) / 100 for name in PANEL_DOSES}
+_COLOURED = {"occluder_grey": GREY, "occluder_magenta": MAGENTA}
+_ALPHAS = {name: int(name.removeprefix("occluder_alpha_")) / 100 for name in OCCLUDER_DOSES}
 _CHANGES: Mapping[str, str] = {
-    "panel_grey": "the panel is grey, near the floor's colour",
-    "panel_magenta": "the panel is magenta, which nothing in any scene is",
-    "panel_large": f"the panel is {WIDER:g} times as wide",
+    "occluder_grey": "the occluder is grey, near the floor's colour",
+    "occluder_magenta": "the occluder is magenta, which nothing in any scene is",
+    "occluder_large": f"the occluder is {WIDER:g} times as wide",
     "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
     "schema_reason": 'it asks for `{"reason", "final_answer"}`: the request of the regime `json`',
     "schema_abstain": 'it asks for `{"reason", "abstain", "final_answer"}`',
@@ -230,7 +233,7 @@ _CHANGES: Mapping[str, str] = {
 }
 _FILMED: Mapping[str, Callable[[Scenario], Take]] = {
     **{name: _coloured(colour) for name, colour in _COLOURED.items()},
-    "panel_large": _large,
+    "occluder_large": _large,
 }
 
 
@@ -240,10 +243,10 @@ def _variation(name: str) -> Arm:
         changes = f"the question offers {count} answers"
         promise = "the true answer and the other world's are always offered; asked with 2, 3 and 6 or not at all"
         return Arm(name, changes, promise, _labels(count), _offered)
-    if name in PANEL_LOOKS:
+    if name in OCCLUDER_LOOKS:
         return Arm(name, _CHANGES[name], _SAME_VOID, _must_abstain, _FILMED[name])
-    if name in PANEL_DOSES:
-        return Arm(name, f"the panel has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, must_answer, _sheer(_ALPHAS[name]))
+    if name in OCCLUDER_DOSES:
+        return Arm(name, f"the occluder has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, must_answer, _sheer(_ALPHAS[name]))
     promises = {
         "frames_later": f"the last {END_S:g} s as shown then show the settled outcome legibly; a void hides it in all",
         "frames_few": "that of the pair, which holds for this rate",
@@ -254,7 +257,7 @@ def _variation(name: str) -> Arm:
 
 
 VARIATIONS: Mapping[str, Arm] = {
-    name: _variation(name) for name in (*_COUNTS, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
+    name: _variation(name) for name in (*_COUNTS, *OCCLUDER_LOOKS, *OCCLUDER_DOSES, *SCHEMAS, *FRAMINGS)
 }
 
 

@@ -1,6 +1,6 @@
 """The two clips of a scenario, replayed from its frozen trajectory: nothing is simulated here.
 
-Occluder: the void is the same replay with the cover panel drawn. Truncation: the void is a prefix of the control. A
+Occluder: the void is the same replay with the occluder drawn. Truncation: the void is a prefix of the control. A
 board comes before a control that closes, and before its void if an occluder makes it; the twin's clip never has one.
 """
 
@@ -18,7 +18,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Family, Physics, Scene
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import Camera, Panel
+from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.picture.coming_board import LANDED, coming_board
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene, decisive_geoms
@@ -31,8 +31,8 @@ ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more withou
 
 @dataclass(frozen=True)
 class Clip:
-    """What is known of an encoded clip. leaked_pixels: void pixels that anything decisive still has (0, or the panel
-    does not hide): from segmentation of every sampled frame and from ablation; None where there is no panel."""
+    """What is known of an encoded clip. leaked_pixels: void pixels that anything decisive still has (0, or the occluder
+    does not hide): from segmentation of every sampled frame and from ablation; None where there is no occluder."""
 
     file_sha256: str
     frames_sha256: str
@@ -131,24 +131,27 @@ def render_pair(job: Job) -> int:
 def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
     """Return what is missing of control and void, and of a twin that is the same scene from another start."""
     spec = job.spec
-    panel, closing = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None, closing_of(spec)
-    behind = panel if closing is None else closing.panel
+    occluder, closing = (
+        Occluder.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
+        closing_of(spec),
+    )
+    behind = occluder if closing is None else closing.occluder
     model, scene = compile_scene(family, family.params_from(spec.params), physics, behind)
     camera = Camera.from_record(spec.camera)
     drawn, open_frames = 0, len(job.qpos) if closing is None else closing.frame
     board = coming_board(closing, camera, len(job.qpos), physics.fps)
     with Renderer(model, camera) as renderer:
         control: list[np.ndarray] = []
-        if job.control in missing or (panel is None and job.void in missing):
+        if job.control in missing or (occluder is None and job.void in missing):
             control = list(checks.closing_frames(renderer, job.qpos, board))
             drawn += len(control)
         if job.control in missing:
             save_clip(job.control, control, physics.fps)
-        if job.void in missing and panel is not None:
+        if job.void in missing and occluder is not None:
             decisive = decisive_geoms(model, scene.decisive)
-            closed = control[open_frames:]  # behind the same panel: these are not drawn again
+            closed = control[open_frames:]  # behind the same occluder: these are not drawn again
             open_to = len(job.qpos) - len(closed)
-            before = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], panel=True)
+            before = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], occluder=True)
             void = [*before, *closed]
             still = [frame for frame, offset in enumerate(board) if offset in (None, LANDED)]
             leaked = _leaked_pixels(renderer, scene, decisive, job, void, still)
@@ -168,16 +171,18 @@ def _leaked_pixels(
     void: Sequence[np.ndarray],
     still: Sequence[int],
 ) -> float:
-    """Return what the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel
-    hides decisive bodies from hiding on, and the hidden element, without a trace. still: frames in which no board
-    comes."""
+    """Return what the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the
+    occluder hides decisive bodies from hiding on, and the hidden element, without a trace. still: frames in which no
+    board comes."""
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
-    past_panel_px = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
+    past_occluder_px = checks.past_occluder(renderer, job.qpos[::step], decisive, scene.hidden).leaked(
+        -(-first // step)
+    )
     hiding = [frame for frame in still if frame >= first]
     ablated = [hiding[i] for i in np.unique(np.linspace(0, len(hiding) - 1, ABLATION_FRAMES).astype(int))]
     complete = [void[frame] for frame in ablated]
-    return past_panel_px + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], complete)
+    return past_occluder_px + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], complete)
 
 
 def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:

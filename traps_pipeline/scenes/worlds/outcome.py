@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.look import paint_panels
+from traps_pipeline.scenes.parts.look import paint_occluders
 from traps_pipeline.scenes.physics.flexes import flexes
-from traps_pipeline.scenes.physics.kit import COMING_GROUP, PANEL_GROUP, Family, Motion, Physics, Scene, add_box
+from traps_pipeline.scenes.physics.kit import COMING_GROUP, OCCLUDER_GROUP, Family, Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.physics.simulate import simulate
-from traps_pipeline.scenes.picture.camera import Panel
+from traps_pipeline.scenes.picture.camera import Occluder
 from traps_pipeline.scenes.picture.coming_board import before_board
 
 if TYPE_CHECKING:
@@ -62,23 +62,23 @@ def last_run(labels: Sequence[str | None]) -> int:
 
 
 def compile_scene(
-    family: Family, params: Any, physics: Physics, panel: Panel | None = None
+    family: Family, params: Any, physics: Physics, occluder: Occluder | None = None
 ) -> tuple[mujoco.MjModel, Scene]:
-    """Return the compiled model of a scene, with the cover panel if one is given, and another one like it, just in
+    """Return the compiled model of a scene, with the occluder if one is given, and another one like it, just in
     front, that comes before the scene where a control closes; each has a geom group of its own and collides with
     nothing."""
     scene = family.build(params, physics)
-    if panel is not None:
-        panels = []
-        for name, group, beside in (("cover_panel", PANEL_GROUP, 0), ("coming_panel", COMING_GROUP, 1)):
-            centre = np.array(panel.centre) + beside * before_board(panel)
-            geom = add_box(scene.spec.worldbody, name, centre.tolist(), panel.half, "navy")
-            half = np.radians(panel.yaw_deg) / 2
+    if occluder is not None:
+        occluders = []
+        for name, group, beside in (("occluder", OCCLUDER_GROUP, 0), ("coming_occluder", COMING_GROUP, 1)):
+            centre = np.array(occluder.centre) + beside * before_board(occluder)
+            geom = add_box(scene.spec.worldbody, name, centre.tolist(), occluder.half, "navy")
+            half = np.radians(occluder.yaw_deg) / 2
             geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
             geom.contype = geom.conaffinity = 0
             geom.group = group
-            panels.append(geom)
-        paint_panels(scene.spec, panels, params)
+            occluders.append(geom)
+        paint_occluders(scene.spec, occluders, params)
     return scene.spec.compile(), scene
 
 

@@ -6,7 +6,7 @@ control alike, so that its length tells nothing of the side. A clip is never lon
 a second are what models are shown. So where the outcome settles too late the scene is drawn anew.
 
 Of an occlusion pair both worlds count, and which of them is the control makes no difference: neither length nor closing
-tells which world the panel hides.
+tells which world the occluder hides.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from traps_pipeline.video.policies import last_of_all
 EARLIEST_SHARE = 0.3  # of the clip's frames, before the outcome settles
 LATEST_SHARE = 0.8
 DRAWN_SHARE = 0.5  # in a clip that ends earlier the outcome settles after a share between the earliest and this
-FRAMES_AFTER = 16  # to see the outcome for a second, and a panel before it until the end
+FRAMES_AFTER = 16  # to see the outcome for a second, and an occluder before it until the end
 READ_S = 0.8  # so long a settled outcome stands in view before a control closes
 READ_BY_DRAW_S = 1.0  # so long it is in view where there is time for it
 REST_BY_DRAW_S = 0.6  # so long it has been at rest by then: three frames of five a second

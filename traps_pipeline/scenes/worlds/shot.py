@@ -1,4 +1,4 @@
-"""The camera of a pair and its panel, fitted to the worlds that it shows: which of two is the control makes no
+"""The camera of a pair and its occluder, fitted to the worlds that it shows: which of two is the control makes no
 difference."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.scenes.physics.kit import Box, Scene
 from traps_pipeline.scenes.physics.simulate import swept_points
-from traps_pipeline.scenes.picture.camera import Camera, Panel, fit_shot
+from traps_pipeline.scenes.picture.camera import Camera, Occluder, fit_shot
 from traps_pipeline.scenes.worlds.world import World
 
 if TYPE_CHECKING:
@@ -24,9 +24,9 @@ def shown_points(model: mujoco.MjModel, scene: Scene, qpos: np.ndarray) -> np.nd
     return np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.framed)])
 
 
-def shot_of(worlds: Sequence[World]) -> tuple[Camera, Panel | None]:
-    """Return the nearest camera that has all worlds in its frame, and the smallest panel that covers what any of them
-    says; no panel if some of them has nothing to cover."""
+def shot_of(worlds: Sequence[World]) -> tuple[Camera, Occluder | None]:
+    """Return the nearest camera that has all worlds in its frame, and the smallest occluder that covers what any of
+    them says; no occluder if some of them has nothing to cover."""
     points = np.concatenate([shown_points(world.model, world.scene, world.qpos) for world in worlds])
     covers = [world.scene.cover for world in worlds if world.scene.cover is not None]
     cover = box_around([box.corners() for box in covers]) if len(covers) == len(worlds) else None

@@ -49,8 +49,8 @@ class _Camera(_Strict):
     centre: list[Length] = Field(min_length=3, max_length=3)
 
 
-class _Panel(_Strict):
-    """`camera.Panel` in a record."""
+class _Box(_Strict):
+    """`camera.Occluder` in a record."""
 
     centre: list[Length] = Field(min_length=3, max_length=3)
     half: list[Length] = Field(min_length=3, max_length=3)
@@ -58,7 +58,7 @@ class _Panel(_Strict):
 
 
 class _Occluder(_Strict):
-    panel: _Panel
+    panel: _Box
     hidden_from_frame: int = Field(ge=0)
 
 
@@ -67,15 +67,15 @@ class _Truncation(_Strict):
 
 
 class _Closing(_Strict):
-    """When the panel of the void comes in the control (occluder)."""
+    """When the occluder of the void comes in the control (occluder)."""
 
     closes_frame: int = Field(ge=1)
 
 
-class _ClosingPanel(_Closing):
-    """When a panel comes in the control, and which (truncation: the void has none)."""
+class _ClosingOccluder(_Closing):
+    """When an occluder comes in the control, and which (truncation: the void has none)."""
 
-    panel: _Panel
+    panel: _Box
 
 
 class Answerable(BaseModel):
@@ -106,8 +106,8 @@ class Twin(BaseModel):
 class SceneSpec(BaseModel):
     """One scenario, resolved: nothing about it is left to chance or to the code's defaults.
 
-    control: how the control closes: from which frame a panel stands before its outcome, and which panel where the void
-    has none; None if no panel comes.
+    control: how the control closes: from which frame an occluder stands before its outcome, and which occluder where
+    the void has none; None if no occluder comes.
 
     Hashes: `scene_hash` covers what decides the pixels (family, params, physics, camera, void, trajectory, twin),
     `spec_hash` covers everything. Both are derived, never read from the file.
@@ -163,7 +163,7 @@ class SceneSpec(BaseModel):
         frame = void.cut_frame if isinstance(void, _Truncation) else void.hidden_from_frame
         frames = {"void": frame}
         if self.control is not None:
-            kind = _ClosingPanel if self.void_kind == "truncation" else _Closing
+            kind = _ClosingOccluder if self.void_kind == "truncation" else _Closing
             frames["control"] = _checked(kind, "control", self.control).closes_frame
         for name, at in frames.items():
             if at >= physics.duration_s * physics.fps:
@@ -172,7 +172,7 @@ class SceneSpec(BaseModel):
 
     @property
     def closes_frame(self) -> int | None:
-        """The frame from which a panel stands before the control's outcome; None if none comes."""
+        """The frame from which an occluder stands before the control's outcome; None if none comes."""
         return None if self.control is None else self.control["closes_frame"]
 
     @property

@@ -13,8 +13,8 @@ from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.flexes import flexes
 from traps_pipeline.scenes.physics.kit import Family, Inventory, Motion, Physics, Scene
 from traps_pipeline.scenes.physics.simulate import replay
-from traps_pipeline.scenes.picture.camera import Camera, Closing, Panel
-from traps_pipeline.scenes.picture.checks import PastPanel, differing_pixels, void_frames
+from traps_pipeline.scenes.picture.camera import Camera, Closing, Occluder
+from traps_pipeline.scenes.picture.checks import PastOccluder, differing_pixels, void_frames
 from traps_pipeline.scenes.picture.coming_board import Coming, coming_board
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE, Renderer
 from traps_pipeline.scenes.worlds.outcome import (
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 class World:
     """A scene with its trajectory and its shot.
 
-    qpos: the trajectory (F, nq). panel: the cover panel of its void, None where the void is a cut. frame_step: pixel
+    qpos: the trajectory (F, nq). occluder: the occluder of its void, None where the void is a cut. frame_step: pixel
     evidence looks at every so many frames. simulated: the trajectory that simulating gives here, where it is known.
-    closing: how the control ends, None if no panel comes.
+    closing: how the control ends, None if no occluder comes.
     """
 
     family: Family
@@ -45,7 +45,7 @@ class World:
     physics: Physics
     qpos: np.ndarray
     camera: Camera
-    panel: Panel | None
+    occluder: Occluder | None
     frame_step: int = 1
     simulated: np.ndarray | None = None
     closing: Closing | None = None
@@ -63,18 +63,18 @@ class World:
             physics=Physics(**spec.physics),
             qpos=qpos,
             camera=Camera.from_record(spec.camera),
-            panel=Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
+            occluder=Occluder.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
             frame_step=frame_step,
             closing=closing_of(spec),
         )
 
     @cached_property
     def _compiled(self) -> tuple[mujoco.MjModel, Scene]:
-        return compile_scene(self.family, self.params, self.physics, self.panel)
+        return compile_scene(self.family, self.params, self.physics, self.occluder)
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, panel included."""
+        """The compiled model, occluder included."""
         return self._compiled[0]
 
     @property
@@ -89,14 +89,14 @@ class World:
 
     @cached_property
     def closed_model(self) -> mujoco.MjModel:
-        """The compiled model with the panel that closes the control: that of the void, or its own."""
-        if self.closing is None or self.panel is not None:
+        """The compiled model with the occluder that closes the control: that of the void, or its own."""
+        if self.closing is None or self.occluder is not None:
             return self.model
-        return compile_scene(self.family, self.params, self.physics, self.closing.panel)[0]
+        return compile_scene(self.family, self.params, self.physics, self.closing.occluder)[0]
 
     @property
     def open_frames(self) -> int:
-        """How many frames the control shows before a panel comes: all of them if none does."""
+        """How many frames the control shows before an occluder comes: all of them if none does."""
         return len(self.qpos) if self.closing is None else self.closing.frame
 
     @cached_property
@@ -159,7 +159,7 @@ class World:
     def closed_off(self) -> tuple[str, ...]:
         """Names of all geoms that nothing may be seen of once the control is closed: what is concealed in the void; of
         a cut scene everything that moves."""
-        return moving_geoms(self.model) if self.panel is None else self.concealed
+        return moving_geoms(self.model) if self.occluder is None else self.concealed
 
     @cached_property
     def geoms(self) -> tuple[str, ...]:
@@ -172,11 +172,11 @@ class World:
         """The frames that pixel evidence of the closed control looks at, the last one always among them."""
         return sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))
 
-    # What is drawn behind the panel, that of the void or the one that closes the control, is needed by several
+    # What is drawn behind the occluder, that of the void or the one that closes the control, is needed by several
     # certificates; each frame is drawn once.
 
-    def behind_panel(self, which: Sequence[int]) -> list[np.ndarray]:
-        """Return some frames of the world behind its panel, as they are drawn."""
+    def behind_occluder(self, which: Sequence[int]) -> list[np.ndarray]:
+        """Return some frames of the world behind its occluder, as they are drawn."""
         missing = [frame for frame in which if frame not in self._behind]
         if missing:
             with self.closed_renderer() as renderer:
@@ -188,13 +188,13 @@ class World:
         return {}
 
     def pixels_of(self, names: Sequence[str], which: Sequence[int] | None = None) -> np.ndarray:
-        """Return how many pixels some geoms have together behind the panel, by segmentation, in some frames, or in
+        """Return how many pixels some geoms have together behind the occluder, by segmentation, in some frames, or in
         those that are looked at, (F,)."""
         which = self.looked_at if which is None else which
         missing = [frame for frame in which if frame not in self._segmented]
         if missing:
             with self.closed_renderer() as renderer:
-                counts = renderer.visible_pixels(self.qpos[missing], self.geoms, panel=True)
+                counts = renderer.visible_pixels(self.qpos[missing], self.geoms, occluder=True)
             self._segmented.update(zip(missing, counts, strict=True))
         columns = [self.geoms.index(name) for name in names]
         return np.array([self._segmented[frame][columns].sum() for frame in which])
@@ -204,10 +204,10 @@ class World:
         return {}
 
     def ablation_px(self, which: Sequence[int], geoms: tuple[str, ...]) -> int:
-        """Return how many pixels change behind the panel, over some frames, when geoms are taken away."""
+        """Return how many pixels change behind the occluder, over some frames, when geoms are taken away."""
         missing = [frame for frame in which if (frame, geoms) not in self._ablated]
         if missing:
-            complete = self.behind_panel(missing)
+            complete = self.behind_occluder(missing)
             with self.closed_renderer() as renderer:
                 without = void_frames(renderer, self.qpos[missing], without=geoms)
                 for frame, one, other in zip(missing, complete, without, strict=True):
@@ -219,18 +219,18 @@ class World:
         return {}
 
     @cached_property
-    def past_panel(self) -> PastPanel:
-        """What is seen past the panel."""
+    def past_occluder(self) -> PastOccluder:
+        """What is seen past the occluder."""
         decisive = decisive_geoms(self.model, self.scene.decisive)
-        return PastPanel(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
+        return PastOccluder(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The world with the panel of its void, as it is drawn."""
-        return self.behind_panel(self.looked_at)
+        """The world with the occluder of its void, as it is drawn."""
+        return self.behind_occluder(self.looked_at)
 
     def closed_renderer(self) -> Renderer:
-        """Return a renderer of this world with the panel that closes the control; close it before another one is
+        """Return a renderer of this world with the occluder that closes the control; close it before another one is
         opened."""
         return Renderer(self.closed_model, self.camera)
 
@@ -239,5 +239,5 @@ def closing_of(spec: SceneSpec) -> Closing | None:
     """Return how the control of a record closes."""
     if spec.control is None:
         return None
-    panel = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]
-    return Closing(spec.control["closes_frame"], Panel.from_record(panel))
+    occluder = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]
+    return Closing(spec.control["closes_frame"], Occluder.from_record(occluder))

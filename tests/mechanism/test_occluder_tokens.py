@@ -1,4 +1,4 @@
-"""States at the tokens that the panel covers, from tables to tables: which clip an item is compared with."""
+"""States at the tokens that the occluder covers, from tables to tables: which clip an item is compared with."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def test_every_item_is_compared_with_the_other_clip_of_its_scenario(study: Works
     assert other_clip(study, arm) == (study.resolve(control.clip), control.media_digest)
 
 
-def test_the_states_of_an_ill_posed_pair_are_those_where_the_panel_would_be(study: Workspace) -> None:
-    """A clip of this study is one visual token, which the panel changes: its mean is that of all visual tokens."""
+def test_the_states_of_an_ill_posed_pair_are_those_where_the_occluder_would_be(study: Workspace) -> None:
+    """A clip of this study is one visual token, which the occluder changes: its mean is that of all visual tokens."""
     changed = pooled(study, "changed")
     own, ill_posed = (states(changed, name) for name in ("occlusion", "occlusion_ill_posed"))
     for n in range(PAIRS):  # the same clip, question and other clip: the same states
