@@ -87,6 +87,17 @@ def test_a_log_has_a_line_for_each_stage_that_worked_and_one_for_all_tables(cloc
     assert report.totals["responses"] == Tally(asked=20, cached=7, errors=1)
 
 
+def test_a_partition_that_became_stale_after_its_stage_began_counts_as_one_to_make(clock: Clock) -> None:
+    out = io.StringIO()
+    report = make_progress("auto", out)
+    report.stage("votes", 1)
+    clock.now = 4.0
+    for key in ("a", "b"):
+        report.partition("votes", key, Tally(asked=3))
+    report.close()
+    assert out.getvalue().splitlines() == ["votes: 2 of 2 made, 6 asked, 0:04"]
+
+
 def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     out = io.StringIO()
     report = make_progress("json", out)

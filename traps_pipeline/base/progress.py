@@ -137,6 +137,8 @@ class Progress:
         if (now := self.current_stage) is not None:
             now.tally.add(tally)
             now.done, now.empty = now.done + 1, now.empty + is_empty
+            if now.partitions:  # one that was fresh when the stage began may be stale by now
+                now.partitions = max(now.partitions, now.done)
             now.share, now.detail = 0.0, ""
         self.changed()
 
