@@ -1,4 +1,4 @@
-"""Certify a whole benchmark: all records on all cores, resumable, with a table of results."""
+"""Certify a whole benchmark on all cores, resumably, with a table of results."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Return verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
+    """Return verdicts on a benchmark folder's records, and all problems in words.
+
+    Problems of scenarios come first.
 
     Verdicts are cached under `kept` by record and code, so that an interrupted call resumes.
     """
@@ -75,7 +77,10 @@ def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
 
 @cache
 def code_digest(family: str) -> str:
-    """Return the digest of the code that certifies a family; cached verdicts of other code are ignored."""
+    """Return the digest of the code that certifies a family.
+
+    Cached verdicts of other code are ignored.
+    """
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])
@@ -97,7 +102,10 @@ def judge(case: Case) -> Verdict:
 
 
 def _alike(verdicts: Iterable[Verdict]) -> list[str]:
-    """Return clips of different scenarios that end in the same frame: no clip may serve two scenarios."""
+    """Return clips of different scenarios that end in the same frame.
+
+    No clip may serve two scenarios.
+    """
     problems = []
     for side in ("control_end", "void_end"):
         owners: defaultdict[str, list[str]] = defaultdict(list)
@@ -109,7 +117,10 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Return families of cut clips, with at least a hundred records, whose state at the cut predicts the outcome."""
+    """Return families of cut clips whose state at the cut predicts the outcome.
+
+    Only families with at least a hundred records are judged.
+    """
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
