@@ -1,4 +1,7 @@
-"""Report which steps of a study this machine can run, and what to install for the others (`traps doctor`)."""
+"""Report which steps this machine can run (`traps doctor`).
+
+For the others it names what to install.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,10 @@ def examine(place: Place) -> Iterator[Finding]:
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield a finding for each requirement of local models: tiny checkpoints, devices, weights, named models."""
+    """Yield a finding for each requirement of local models.
+
+    They are tiny checkpoints, devices, weights and named models.
+    """
     from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
@@ -133,7 +139,10 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return the old unreferenced objects in a study's store, and whether they were removed. Raises TrapsError."""
+    """Return the old unreferenced objects in a study's store.
+
+    The finding tells whether they were removed. Raises TrapsError.
+    """
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
@@ -178,7 +187,10 @@ def _damaged_media(note: Path) -> str:
 
 
 def _damaged_history(path: Path) -> str:
-    """Return why a history is damaged. The next command puts it aside and begins anew, so nothing is lost."""
+    """Return why a history is damaged.
+
+    The next command puts it aside and begins anew, so nothing is lost.
+    """
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
             (result,) = opened.execute("pragma quick_check(1)").fetchone()
@@ -188,7 +200,10 @@ def _damaged_history(path: Path) -> str:
 
 
 def _remove_unfinished(root: Path) -> str:
-    """Remove old unfinished files of killed runs; a run may still be writing young ones."""
+    """Remove old unfinished files of killed runs.
+
+    A run may still be writing young ones.
+    """
     old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
     size = sum(path.stat().st_size for path in old)
     for path in old:
@@ -231,7 +246,10 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """Return the missing keys with the entries that need them. Raises TrapsError for one that no header can carry."""
+    """Return the missing keys with the entries that need them.
+
+    Raises TrapsError for one that no header can carry.
+    """
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 

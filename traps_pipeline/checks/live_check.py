@@ -1,4 +1,6 @@
-"""Check models and judges with live calls before money is spent: `traps models check --live`, and preflight.
+"""Check models and judges with live calls before money is spent.
+
+`traps models check --live` and the preflight of a run do.
 
 Each model is asked about a clip that is red and then blue, once with the clip and once without, and in its JSON form;
 each judge votes on answers with known votes. Every problem is a sentence that names the cause and the remedy.
@@ -63,7 +65,10 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class LiveResult:
-    """The result for an entry. problems: reasons why its answers are worthless; notes: other observations."""
+    """The result for an entry.
+
+    problems: reasons why its answers are worthless. notes: other observations.
+    """
 
     entry: Entry
     problems: Sequence[str]
@@ -84,7 +89,10 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry, by name. They contain the time, so that yesterday's answers are not reused."""
+    """Return the calls to an entry, by name.
+
+    They contain the time, so that yesterday's answers are not reused.
+    """
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -176,7 +184,10 @@ def _listed(answer: Any) -> list[Any]:
 def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
-    """Return the problems and notes from the outcomes of `requests_of`, and from the checks before them."""
+    """Return the problems and notes of an entry's outcomes.
+
+    outcomes: of `requests_of`. reached: of the checks before them.
+    """
     problems, notes, before = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:
@@ -285,7 +296,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
 
 
 def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
-    """Return whether the clip arrives: the answer names its two colours, or its tokens are counted."""
+    """Return whether the clip arrives, from the answer's colours or counted tokens."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []

@@ -1,4 +1,7 @@
-"""Parse the request bodies of providers' APIs into one form, and list each API's fields for each parameter."""
+"""Parse request bodies of providers' APIs into one form.
+
+It also lists each API's fields for each parameter.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,10 @@ class ParsedBody:
 
 
 def read_body(wire: WireBody) -> ParsedBody:
-    """Return the parsed body. Raises one of `UNKNOWN_FORM` if its form is unknown."""
+    """Return the parsed body.
+
+    Raises one of `UNKNOWN_FORM` if its form is unknown.
+    """
     body = _camel(wire.body) if wire.api == "gemini" else dict(wire.body)
     model = body.pop("model", None) or wire.path.rsplit("/", 1)[-1].removesuffix(":generateContent")
     match wire.api:
@@ -94,7 +100,10 @@ def _turn(turn: Mapping[str, Any]) -> tuple[str, list[str | ClipPart | None]]:
 
 
 def _part(part: Mapping[str, Any]) -> str | ClipPart | None:
-    """Return a part of a turn, in the form of any of the APIs; None for an unknown kind of part."""
+    """Return a part of a turn in the one form.
+
+    None for an unknown kind of part.
+    """
     match part:
         case {"text": str(text), **rest} if rest.keys() <= {"type"}:
             return text
@@ -115,7 +124,10 @@ def _clip(uri: str, fps: float | None = None) -> ClipPart:
 
 
 def _camel(value: Any) -> Any:
-    """Return the value with Gemini's names in camelCase: Gemini accepts snake_case too, and litellm mixes both."""
+    """Return the value with Gemini's names in camelCase.
+
+    Gemini accepts snake_case too, and litellm mixes both.
+    """
     if isinstance(value, list):
         return [_camel(one) for one in value]
     if not isinstance(value, dict):
