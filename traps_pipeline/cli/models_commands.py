@@ -1,4 +1,7 @@
-"""`traps models`: check that entries send what they declare and answer, and that no answer can instruct a panel."""
+"""Check that entries send what they declare and answer (`traps models`).
+
+`test-panel` checks that no answer can instruct a panel.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,9 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _named(arguments: argparse.Namespace) -> list[str]:
-    """Return the ids of the named models and judges, with those of named panels and experiments.
+    """Return the ids of the named models and judges.
+
+    Those of named panels and experiments are among them.
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
     """

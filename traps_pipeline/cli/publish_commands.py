@@ -1,4 +1,7 @@
-"""`traps publish`: write and verify releases and submissions, harness folders, results files and leaderboards."""
+"""Write and verify what a study publishes (`traps publish`).
+
+Releases, submissions, harness folders, results files and leaderboards.
+"""
 
 from __future__ import annotations
 
@@ -102,7 +105,10 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def _date(text: str | None) -> str | None:
-    """Return a date unchanged. Raises TrapsError if it is invalid."""
+    """Return a date unchanged.
+
+    Raises TrapsError if it is invalid.
+    """
     from datetime import date
 
     try:

@@ -1,4 +1,7 @@
-"""`traps results`: write the explorer and all results, audit the published tables, compare studies."""
+"""Write, audit and compare results (`traps results`).
+
+The explorer is one of them.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,10 @@ def _megabytes(size: int) -> str:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """See `traps results audit --help`. Discrepancies of the published tables are findings, not failures."""
+    """See `traps results audit --help`.
+
+    Discrepancies of the published tables are findings, not failures.
+    """
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()

@@ -1,4 +1,4 @@
-"""`traps status` and `traps why`: show the state of a study and of an item's answers."""
+"""Show the state of a study and of an item (`traps status`, `traps why`)."""
 
 from __future__ import annotations
 
@@ -79,7 +79,10 @@ def status(arguments: argparse.Namespace) -> int:
 
 
 def _command(workspace: Workspace, experiment: str | None) -> str:
-    """Return the command that refreshes stale partitions, for the given experiment or the study's only one."""
+    """Return the command that refreshes stale partitions.
+
+    It names the given experiment, or the study's only one.
+    """
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
     given = [experiment] if experiment else [*workspace.study.experiments]

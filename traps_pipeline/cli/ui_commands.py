@@ -1,4 +1,4 @@
-"""`traps ui`: serve Dagster's pages of a study, for the person who started it only."""
+"""Serve a study's Dagster pages to the person who started it (`traps ui`)."""
 
 from __future__ import annotations
 
