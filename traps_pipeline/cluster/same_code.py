@@ -32,7 +32,9 @@ def code_here() -> str:
 
 
 def installed_versions() -> dict[str, str]:
-    """Return installed versions of Python, of this package, and of its dependencies, by name.
+    """Return installed versions of Python, this package and its dependencies.
+
+    By name.
 
     Builds for other hardware (`+cpu`, `+cu128`) count as the same version.
     """
@@ -49,7 +51,9 @@ def installed_versions() -> dict[str, str]:
 
 
 def require_same_code(submitted: str, study: str) -> None:
-    """Check that a run was submitted by a host with the same code. Raises TrapsError.
+    """Check that a run was submitted by a host with the same code.
+
+    Raises TrapsError.
 
     submitted: the result of `code_here` there. Packages that only one of the two has are ignored: a host without a GPU
     need not have a GPU's packages.
