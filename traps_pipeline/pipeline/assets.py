@@ -40,7 +40,10 @@ class WorkspaceResource(dg.ConfigurableResource):
         self._steps.close()
 
     def open(self) -> Workspace:
-        """Return the workspace. Raises TrapsError naming the remedy where there is none."""
+        """Return the workspace.
+
+        Raises TrapsError naming the remedy where there is none.
+        """
         return Workspace.open()
 
 
@@ -99,7 +102,7 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
 
 
 def _contract(table: Table) -> dict[str, Any]:
-    """Return a table's columns and the meaning of a row, in the form that Dagster shows."""
+    """Return a table's columns and the meaning of a row, as Dagster shows them."""
     columns = [
         dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
         for c in table.columns

@@ -1,4 +1,6 @@
-"""Dagster's SQLite storage with persistent connections: an event costs a quarter of the time.
+"""Keep connections of Dagster's SQLite storage open.
+
+An event then costs a quarter of the time.
 
 For each event Dagster makes an engine, which compiles its statements anew, and opens and closes the file. Here the
 engine of a file is kept. Its commits go to SQLite's write-ahead log beside the file, which Dagster's pages do not
@@ -26,7 +28,10 @@ _BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
 class HistoryUnwritable(OperationalError):
-    """A full, failing or read-only disk. Dagster prints and stores this message, so it is ours."""
+    """A full, failing or read-only disk.
+
+    Dagster prints and stores this message, so it is ours.
+    """
 
     sentence = ""
 
@@ -36,7 +41,10 @@ class HistoryUnwritable(OperationalError):
 
 @contextlib.contextmanager
 def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
-    """Commit what the block changes when it ends without an error. Raises HistoryUnwritable."""
+    """Commit what the block changes when it ends without an error.
+
+    Raises HistoryUnwritable.
+    """
     try:
         with engine.begin() as connection:
             yield connection

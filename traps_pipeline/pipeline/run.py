@@ -1,4 +1,7 @@
-"""Walk the graph and materialize what is missing or stale, one Dagster run per block of stages."""
+"""Walk the graph and materialize what is missing or stale.
+
+One Dagster run builds one block of stages.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class WalkResult:
-    """The result of a walk: problems in sentences, including failed checks; whether a budget ended it."""
+    """The result of a walk.
+
+    Problems in sentences, including failed checks, and whether a budget ended it.
+    """
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -40,7 +46,9 @@ class WalkResult:
 
 @contextmanager
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
-    """Open Dagster's history of this workspace, one process at a time: concurrent first openings corrupt it.
+    """Open this workspace's Dagster history, one process at a time.
+
+    Concurrent first openings would corrupt it.
 
     Runs whose process was killed are marked as failed, since a queue would count them forever. A lost history begins
     anew, and so does an unreadable one, which is kept beside it: the tables are authoritative. Raises TrapsError if the
@@ -104,7 +112,10 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
 
 def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
-    """Open a folder's instance. is_captured: write steps' output to Dagster's files, as runs on other hosts must."""
+    """Open a folder's instance.
+
+    is_captured: write steps' output to Dagster's files, as runs on other hosts must.
+    """
     if is_captured:
         return dg.DagsterInstance.from_config(str(home))
     silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
@@ -124,7 +135,9 @@ def _alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return a block's stages with work to do or downstream of such a stage, and the keys of these.
+    """Return a block's stages that must run, and the keys of these.
+
+    They have work to do or lie downstream of such a stage.
 
     existing: only what exists, is outdated, and waits for nothing upstream.
     """

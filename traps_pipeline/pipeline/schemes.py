@@ -1,4 +1,4 @@
-"""The study's partitioning schemes, with the keys of the study that `TRAPS_WORKSPACE` names."""
+"""Partition the study that `TRAPS_WORKSPACE` names."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ by_steering = ByDimension("steering")
 
 
 def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], Iterable[str]]) -> Pairs:
-    """Return the downstream keys of each upstream partition, limited to the study's keys."""
+    """Return each upstream partition's downstream keys that the study has."""
     pairs = {key: sorted(below.known & {*mapping(key)}) for key in sorted(above.known)}
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 

@@ -1,4 +1,6 @@
-"""Compute which partitions a study wants: what its experiments ask about its scenarios.
+"""Compute which partitions a study wants.
+
+They are what its experiments ask about its scenarios.
 
 Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
 model that no experiment of the study names.
@@ -48,7 +50,7 @@ class StudyPartitions:
 
     @cached_property
     def categories(self) -> list[str]:
-        """Categories with scenarios, and those whose scenarios were all discarded after their table was made."""
+        """Categories with scenarios, or with a table made before all were discarded."""
         if self._workspace is None:
             return [*CATEGORIES]
         existing = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
@@ -101,7 +103,10 @@ class StudyPartitions:
 
     @cached_property
     def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
-        """Datasets (no arms) and settings of the mechanistic analyses; None if there are none."""
+        """Datasets (no arms) and settings of the mechanistic analyses.
+
+        None if there are none.
+        """
         if self._workspace is None:
             return [*DATASETS], None
         settings = self._workspace.study.mechanism
@@ -187,7 +192,10 @@ class StudyPartitions:
 
 
 def _evaluations(experiment: Asked) -> list[Evaluation]:
-    """Return the experiment's evaluations for which a model has enough runs; all of its runs if none are named."""
+    """Return the experiment's evaluations for which a model has enough runs.
+
+    All of its runs if none are named.
+    """
     evaluations = []
     for model in experiment.models:
         available = range(1, get_model(model).runs + 1)

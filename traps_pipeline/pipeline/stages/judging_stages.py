@@ -1,4 +1,7 @@
-"""The judging group: agreement of the panel, bias of its judges, and confabulation in void failures."""
+"""Declare the judging group.
+
+Agreement of the panel, bias of its judges, and confabulation in void failures.
+"""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -27,13 +30,19 @@ _stage, _source = partial(stage, group="judging"), partial(source, group="judgin
 
 @_source(kinds=["yaml"])
 def confabulation_protocol(workspace: Workspace, _: None) -> str:
-    """assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels."""
+    """Return the version of the confabulation protocol.
+
+    assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels.
+    """
     return protocol_digest(workspace.study.panel)
 
 
 @_source(kinds=["parquet"])
 def judge_validation(workspace: Workspace, _: None) -> str:
-    """The comparison of the judge with two annotators, which `traps people validate` writes."""
+    """Return the version of the comparison of the judge with two annotators.
+
+    `traps people validate` writes it.
+    """
     state = workspace.tables.state(JUDGE_VALIDATION, {})
     return state.version if state else "not run"
 
@@ -43,7 +52,10 @@ def _panel(workspace: Workspace) -> list[str]:
 
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
-    """Return the votes of the study's panel as it is now. Raises TrapsError if there is none."""
+    """Return the votes of the study's panel as it is now.
+
+    Raises TrapsError if there is none.
+    """
     cast = current_rows(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
     cast = cast.loc[cast["panel"] == panel_id(workspace.study.panel)]
     if cast.empty:
@@ -56,7 +68,10 @@ _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 @_stage(AGREEMENT, parents=_VOTED, wants=asks_pairs)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return agreement of the panel and any two judges by dataset and task: unanimity, Fleiss, Cohen, Krippendorff."""
+    """Return agreement of the panel and any two judges by dataset and task.
+
+    Unanimity, Fleiss, Cohen, Krippendorff.
+    """
     from traps_pipeline.judging.agreement import agreement as rows_of
 
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))
@@ -64,7 +79,10 @@ def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(JUDGE_BIAS, parents=_VOTED, wants=asks_pairs)
 def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return each judge's rate of yes against the panel's majority, per dataset and task."""
+    """Return each judge's rate of yes against the panel's majority.
+
+    Per dataset and task.
+    """
     from traps_pipeline.judging.agreement import judge_bias as rows_of
 
     return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
@@ -117,7 +135,10 @@ def confabulation(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(CONFABULATION_PREVALENCE, parents=[confabulation])
 def confabulation_prevalence(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return how often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
+    """Return how often each axis applies to each model's sampled void failures.
+
+    Empty if nothing was labelled.
+    """
     from traps_pipeline.scoring.prevalence import prevalence
 
     return prevalence(workspace.tables.read(CONFABULATION, {}))

@@ -1,4 +1,7 @@
-"""The mechanism group: hidden states of local models, probes, void directions, steering (docs/spec.md 7 and 8)."""
+"""Declare the mechanism group (docs/spec.md 7 and 8).
+
+Hidden states of local models, probes, void directions, steering.
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -119,7 +122,10 @@ def _lost_states(workspace: Workspace, key: str) -> list[str]:
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 def hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Return a frozen local model's hidden states at every layer, one row per item; extract only missing ones."""
+    """Return a local model's hidden states at every layer, one row per item.
+
+    The model is frozen, and only missing states are extracted.
+    """
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
@@ -146,7 +152,10 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 def probes(workspace: Workspace, key: str) -> StageOutput:
-    """Return probes of every dataset on every other by layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
+    """Return probes of every dataset on every other, by layer.
+
+    Transfer, Cf->Cf, within, label-shuffled, centroids.
+    """
     from traps_pipeline.mechanism.stages import probe_rows
 
     return StageOutput(probe_rows(workspace, Extraction.parse(key)))
@@ -165,7 +174,10 @@ def _lost_directions(workspace: Workspace, key: str) -> list[str]:
     lost=_lost_directions,
 )
 def directions(workspace: Workspace, key: str) -> StageOutput:
-    """Return the void direction of every dataset at every layer, with draws of its nulls, as files."""
+    """Return the void direction of every dataset at every layer, as files.
+
+    With draws of its nulls.
+    """
     from traps_pipeline.mechanism.stages import direction_rows
 
     return StageOutput(direction_rows(workspace, Extraction.parse(key)))
@@ -173,7 +185,10 @@ def directions(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(COSINES, code="2", parents=[of(directions, need="some"), of(hidden_states, need="some")], wants=steers)
 def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
-    """Return cosines of every two void directions of a model at one layer, with their reliability."""
+    """Return cosines of every two void directions of a model at one layer.
+
+    With their reliability.
+    """
     from traps_pipeline.mechanism.cosines import cosine_rows
 
     return cosine_rows(workspace)
@@ -189,7 +204,10 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
     side_by_side=True,
 )
 def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield answers of a model that is steered along every path into a dataset; answers in the ledger are reused."""
+    """Yield answers of a model that is steered along every path into a dataset.
+
+    Answers in the ledger are reused.
+    """
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
@@ -210,7 +228,10 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
     side_by_side=True,
 )
 def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield the panel's votes on whether each steered answer abstains, and whether a control's is correct."""
+    """Yield the panel's votes on each steered answer.
+
+    On whether it abstains, and whether a control's is correct.
+    """
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for done, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):

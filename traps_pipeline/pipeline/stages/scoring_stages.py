@@ -41,7 +41,10 @@ def asks_pairs(partitions: StudyPartitions, key: str | None) -> bool:
 
 
 def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
-    """Return a check that counts what `find` (module.function of `scoring`) finds wrong in a table."""
+    """Return a check that counts a table's wrong rows.
+
+    find: module.function of `scoring` that finds them.
+    """
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> str:
         module, _, name = find.partition(".")
@@ -64,7 +67,10 @@ def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutp
     ],
 )
 def metrics(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
+    """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset.
+
+    By scope (docs/spec.md 5.1).
+    """
     from traps_pipeline.scoring.metrics import cell_metrics
 
     judged = current_rows(workspace, VERDICTS, dataset=dataset)
@@ -74,7 +80,10 @@ def metrics(workspace: Workspace, dataset: str) -> StageOutput:
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """Return all METRICS rows of the pairs, and the VERDICTS rows from which they are made, without arms."""
+    """Return all METRICS rows of the pairs, and the VERDICTS rows behind them.
+
+    Without arms.
+    """
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
         raise TrapsError(f"{name}: no metrics yet; materialize metrics for a dataset first")
@@ -88,7 +97,10 @@ _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 
 @_stage(CONTRASTS, parents=_SCORED, wants=asks_pairs)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
-    """Return paired differences between models and between regimes, with intervals and Holm's correction."""
+    """Return paired differences between models and between regimes.
+
+    With intervals and Holm's correction.
+    """
     from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
@@ -102,7 +114,10 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(REGIME_TESTS, parents=_SCORED, wants=asks_pairs)
 def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
+    """Return McNemar's exact test of any two regimes on the same items.
+
+    By model, dataset, run and decision.
+    """
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
     return mcnemar(_scored(workspace, "regime_tests")[1])
@@ -121,7 +136,10 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     wants=asks_pairs,
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
-    """Return every model under every regime, per dataset and overall: means, spreads, 95 % intervals, ranks."""
+    """Return the leaderboard: every model under every regime.
+
+    Per dataset and overall: means, spreads, 95 % intervals, ranks.
+    """
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
     from traps_pipeline.scoring.standings import leaderboard as rank
@@ -144,7 +162,9 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     wants=asks_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm.
+    """Return conjunction, robust figure and inference of models and regimes.
+
+    Of those with all four datasets and an arm.
 
     The table is empty if no arm was run.
     """
@@ -168,7 +188,9 @@ def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return abstention and accuracy as one property of the pairs changes step by step, beside shortcut rules.
+    """Return abstention and accuracy as one property of the pairs changes.
+
+    It changes step by step; shortcut rules stand beside.
 
     The table is empty if no variation was run.
     """
@@ -197,7 +219,9 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return what every model and regime earns on graded cuts, against the true distribution over answers.
+    """Return what every model and regime earns on graded cuts.
+
+    Against the true distribution over answers.
 
     The table is empty if no graded cut was run.
     """
