@@ -36,7 +36,10 @@ category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonom
 
 @_source()
 def released_specs(workspace: Workspace, category: str) -> str:
-    """Frozen scenarios under scene_specs/released, one resolved record each."""
+    """Return the version of the frozen scenarios under scene_specs/released.
+
+    One resolved record each.
+    """
     return released_version(workspace, category)
 
 

@@ -33,23 +33,26 @@ _stage, _source = partial(stage, group="evaluation", scheme=CELL), partial(sourc
 
 @_source(kinds=["yaml"], scheme=EVALUATION)
 def models(workspace: Workspace, key: str) -> str:
-    """Return the version of assets/models.yaml that decides a model's answers.
+    """Return the version of a model's entry in assets/models.yaml.
 
-    By evaluation.
+    It covers the settings that the model's answers depend on.
     """
     return answering_version(Evaluation.parse(key))
 
 
 @_source(kinds=["text"], scheme=EVALUATION)
 def prompts(workspace: Workspace, key: str) -> str:
-    """assets/prompts: the regime's system prompt, by evaluation."""
+    """Return the version of a regime's system prompt (assets/prompts)."""
     datasets = {d for experiment in workspace.study.experiments.values() for d in experiment.datasets}
     return prompt_version(Evaluation.parse(key).regime, datasets)
 
 
 @_source(kinds=["yaml"])
 def judges(workspace: Workspace, _: None) -> str:
-    """assets/judges.yaml and the judges' prompts: the study's panel."""
+    """Return the version of the study's panel.
+
+    It covers assets/judges.yaml and the judges' prompts.
+    """
     return panel_version(workspace.study.panel)
 
 
@@ -127,7 +130,7 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
 def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Return votes of the study's panel on the answers of a cell.
 
-    One row per answer, judge and task.
+    There is one row per answer, judge and task.
     """
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 

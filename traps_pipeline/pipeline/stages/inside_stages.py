@@ -45,7 +45,7 @@ _GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for 
 def patching_settings(workspace: Workspace, key: str) -> str:
     """Return the version of the settings of patching.
 
-    Checkpoint, precision, prompt, pairs and sites.
+    They are checkpoint, precision, prompt, pairs and sites.
     """
     return patching_version(workspace, Extraction.parse(key))
 
@@ -54,7 +54,7 @@ def patching_settings(workspace: Workspace, key: str) -> str:
 def sentence_settings(workspace: Workspace, key: str) -> str:
     """Return the version of the settings of sentences.
 
-    Checkpoint, precision, prompt, and the study's sentences.
+    They are checkpoint, precision, prompt and the study's sentences.
     """
     return sentence_version(workspace, Extraction.parse(key))
 
@@ -83,9 +83,9 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
-    """Return the probing protocol on inputs other than states.
+    """Return the probing protocol on other inputs than states.
 
-    On raw inputs, on the model's output margin and on noise.
+    They are raw inputs, the model's output margin and noise.
     """
     from traps_pipeline.mechanism.baselines import baseline_rows
 
@@ -128,7 +128,7 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
 def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
     """Return risk against coverage as a gate withholds more answers.
 
-    Over the four datasets.
+    It is computed over the four datasets.
     """
     from traps_pipeline.mechanism.gating import curve_rows
 
@@ -139,7 +139,7 @@ def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
 def lens(workspace: Workspace, key: str) -> StageOutput:
     """Return the output margin of stored states at every layer.
 
-    Through the model's final norm and head.
+    They pass through the model's final norm and head.
     """
     from traps_pipeline.mechanism.lens import lens_rows
 
@@ -191,7 +191,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
 def patching(workspace: Workspace, key: str) -> StageOutput:
     """Return indirect effects of groups of positions by layer, beside nulls.
 
-    Between matched controls and voids.
+    States are exchanged between matched controls and voids.
     """
     from traps_pipeline.mechanism.patching_stage import patching_rows
 
@@ -216,7 +216,7 @@ def steering_nulls(workspace: Workspace, _: None) -> list[tables.SteeringNullRow
 def steering_pecs(workspace: Workspace, _: None) -> list[tables.SteeringPecsRow]:
     """Return PECS of the steered model under each sign policy.
 
-    With the share of degenerate answers.
+    The share of degenerate answers stands beside it.
     """
     from traps_pipeline.mechanism.nulls import pecs_rows
 

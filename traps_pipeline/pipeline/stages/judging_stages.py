@@ -32,7 +32,7 @@ _stage, _source = partial(stage, group="judging"), partial(source, group="judgin
 def confabulation_protocol(workspace: Workspace, _: None) -> str:
     """Return the version of the confabulation protocol.
 
-    assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels.
+    assets/confabulation.yaml and its prompt name the models whose failures are sampled, and the judge that labels.
     """
     return protocol_digest(workspace.study.panel)
 
@@ -70,7 +70,7 @@ _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return agreement of the panel and any two judges by dataset and task.
 
-    Unanimity, Fleiss, Cohen, Krippendorff.
+    The measures are unanimity, Fleiss, Cohen and Krippendorff.
     """
     from traps_pipeline.judging.agreement import agreement as rows_of
 
@@ -79,10 +79,7 @@ def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(JUDGE_BIAS, parents=_VOTED, wants=asks_pairs)
 def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return each judge's rate of yes against the panel's majority.
-
-    Per dataset and task.
-    """
+    """Return each judge's rate of yes against the majority, by dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias as rows_of
 
     return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
@@ -135,9 +132,9 @@ def confabulation(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(CONFABULATION_PREVALENCE, parents=[confabulation])
 def confabulation_prevalence(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return how often each axis applies to each model's sampled void failures.
+    """Return how often each axis applies to a model's sampled void failures.
 
-    Empty if nothing was labelled.
+    It is empty if nothing was labelled.
     """
     from traps_pipeline.scoring.prevalence import prevalence
 

@@ -60,19 +60,28 @@ _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_c
 
 @_source(scheme=EXTRACTION)
 def extraction_settings(workspace: Workspace, key: str) -> str:
-    """The inputs of hidden states besides items: checkpoint, precision, prompt."""
+    """Return the version of the settings of hidden states.
+
+    They are checkpoint, precision and prompt.
+    """
     return versions.extraction_version(workspace, Extraction.parse(key))
 
 
 @_source(scheme=EXTRACTION)
 def probing_settings(workspace: Workspace, key: str) -> str:
-    """The study's settings of probes and directions, by model."""
+    """Return the version of the study's settings of probes and directions.
+
+    Each model has its own.
+    """
     return versions.probing_version(workspace, Extraction.parse(key))
 
 
 @_source(scheme=schemes.STEERED)
 def steering_settings(workspace: Workspace, key: str) -> str:
-    """The study's settings of steering, the model and its prompt."""
+    """Return the version of the settings of steering.
+
+    They are the study's settings, the model and its prompt.
+    """
     return versions.steering_version(workspace, key)
 
 
@@ -154,7 +163,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
 def probes(workspace: Workspace, key: str) -> StageOutput:
     """Return probes of every dataset on every other, by layer.
 
-    Transfer, Cf->Cf, within, label-shuffled, centroids.
+    They measure transfer, Cf->Cf, within, label-shuffled and centroids.
     """
     from traps_pipeline.mechanism.stages import probe_rows
 
@@ -174,9 +183,9 @@ def _lost_directions(workspace: Workspace, key: str) -> list[str]:
     lost=_lost_directions,
 )
 def directions(workspace: Workspace, key: str) -> StageOutput:
-    """Return the void direction of every dataset at every layer, as files.
+    """Return each dataset's void direction at every layer, with draws of its nulls.
 
-    With draws of its nulls.
+    They are files.
     """
     from traps_pipeline.mechanism.stages import direction_rows
 
@@ -185,9 +194,9 @@ def directions(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(COSINES, code="2", parents=[of(directions, need="some"), of(hidden_states, need="some")], wants=steers)
 def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
-    """Return cosines of every two void directions of a model at one layer.
+    """Return cosines of any two void directions of a model at one layer.
 
-    With their reliability.
+    Each has its reliability beside it.
     """
     from traps_pipeline.mechanism.cosines import cosine_rows
 
@@ -230,7 +239,7 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
 def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Yield the panel's votes on each steered answer.
 
-    On whether it abstains, and whether a control's is correct.
+    They say whether it abstains, and whether a control's is correct.
     """
     from traps_pipeline.mechanism.steering import collect_steering_votes
 

@@ -28,9 +28,9 @@ _stage, _source = partial(stage, group="people"), partial(source, group="people"
 
 @_source(kinds=["json"])
 def people(workspace: Workspace, _: None) -> str:
-    """Return the version of the labels from the pages of `traps people annotate`.
+    """Return the version of people's labels, in order of submission.
 
-    In order of submission.
+    People gave them on the pages of `traps people annotate`.
     """
     return labels_version(workspace.labels)
 
@@ -39,7 +39,7 @@ def people(workspace: Workspace, _: None) -> str:
 def annotation_protocol(workspace: Workspace, _: None) -> str:
     """Return the version of the annotation protocol.
 
-    assets/annotation.yaml: the samples that people label, and the definition of a split panel.
+    assets/annotation.yaml defines the samples that people label, and a split panel.
     """
     return file_digest(PROTOCOL_FILE)[:16]
 
@@ -51,7 +51,7 @@ _LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, c
 def human_labels(workspace: Workspace, _: None) -> StageOutput:
     """Return people's labels of the study's clips and answers.
 
-    Each with its item and the panel's decision.
+    Each has its item and the panel's decision beside it.
 
     The table is empty until somebody has labelled.
     """
@@ -72,7 +72,7 @@ def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return people's Acc, AbsRec, FalseAbs and PECS with intervals.
 
-    With their agreement, and seconds per clip.
+    Their agreement and seconds per clip stand beside.
     """
     from traps_pipeline.people.human_scores import human_row as rows_of
 
@@ -94,7 +94,7 @@ _AGAINST = (human_labels, of(verdicts, need="none"), judges)
 def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return the panel's sensitivity and specificity against people, by task.
 
-    Empty until it is validated.
+    It is empty until the panel is validated.
     """
     from traps_pipeline.people.corrected_scores import panel_errors as rows_of
 

@@ -35,7 +35,7 @@ _stage = partial(stage, group=GROUP, kinds=["html"])
 
 @source(group=GROUP, kinds=["csv"])
 def published(workspace: Workspace, _: None) -> str:
-    """assets/published: the paper's tables as printed."""
+    """Return the version of the paper's tables as printed (assets/published)."""
     return published_digest()
 
 

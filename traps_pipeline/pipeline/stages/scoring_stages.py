@@ -69,7 +69,7 @@ def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutp
 def metrics(workspace: Workspace, dataset: str) -> StageOutput:
     """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset.
 
-    By scope (docs/spec.md 5.1).
+    Each scope has a row (docs/spec.md 5.1).
     """
     from traps_pipeline.scoring.metrics import cell_metrics
 
@@ -99,7 +99,7 @@ _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
     """Return paired differences between models and between regimes.
 
-    With intervals and Holm's correction.
+    They have intervals and Holm's correction.
     """
     from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
@@ -116,7 +116,7 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
 def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return McNemar's exact test of any two regimes on the same items.
 
-    By model, dataset, run and decision.
+    Each model, dataset, run and decision has a row.
     """
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
@@ -136,9 +136,9 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     wants=asks_pairs,
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
-    """Return the leaderboard: every model under every regime.
+    """Return every model under every regime, per dataset and overall.
 
-    Per dataset and overall: means, spreads, 95 % intervals, ranks.
+    Means, spreads, 95 % intervals and ranks are given.
     """
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
@@ -162,9 +162,9 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     wants=asks_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return conjunction, robust figure and inference of models and regimes.
+    """Return conjunction, robust figure and inference of each model and regime.
 
-    Of those with all four datasets and an arm.
+    Only those with all four datasets and an arm have a row.
 
     The table is empty if no arm was run.
     """
@@ -188,9 +188,9 @@ def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return abstention and accuracy as one property of the pairs changes.
+    """Return abstention and accuracy as one property of pairs changes by steps.
 
-    It changes step by step; shortcut rules stand beside.
+    Shortcut rules stand beside.
 
     The table is empty if no variation was run.
     """
@@ -219,9 +219,9 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return what every model and regime earns on graded cuts.
+    """Return what each model and regime earns on graded cuts.
 
-    Against the true distribution over answers.
+    It is scored against the true distribution over answers.
 
     The table is empty if no graded cut was run.
     """
