@@ -65,7 +65,7 @@ def source(
     """Declare a source by the function of its name, which returns its data version."""
 
     def declare(version: Callable[[Workspace, Any], str]) -> Source:
-        one = Source(version.__name__, version, group, _doc(version), kinds, scheme)
+        one = Source(version.__name__, version, group, _result(_doc(version)), kinds, scheme)
         _declare(one)
         return one
 
@@ -148,7 +148,7 @@ def _result(doc: str) -> str:
 
     In Dagster it describes what is made.
     """
-    text = doc.removeprefix("Return ")
+    text = doc.removeprefix("Return ").removeprefix("Yield ").removeprefix("the version of ")
     return text[:1].upper() + text[1:]
 
 
