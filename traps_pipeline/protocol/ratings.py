@@ -1,4 +1,6 @@
-"""Votes of judges as a matrix (one row per answer and task, one column per judge), and their majority.
+"""Arrange votes of judges as a matrix, and count their majority.
+
+One row per answer and task, one column per judge.
 
 Verdicts, agreement, bias and scores without one judge are all computed from this matrix.
 """
@@ -80,7 +82,10 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return each vote's group number by these columns, (votes,), and the first vote of each group, (groups,)."""
+    """Return each vote's group by these columns, and each group's first vote.
+
+    Shapes (votes,) and (groups,).
+    """
     import pandas as pd
 
     code = np.zeros(len(votes), np.int64)
@@ -99,7 +104,10 @@ def _decisions(votes: pd.DataFrame) -> np.ndarray:
 
 
 def majority(values: np.ndarray) -> np.ndarray:
-    """Return the vote of more than half of the judges, (rows,) int8; INVALID without such a majority."""
+    """Return the vote of more than half of the judges, (rows,) int8.
+
+    INVALID without such a majority.
+    """
     half = values.shape[1] / 2
     yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
     return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)
