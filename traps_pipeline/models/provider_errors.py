@@ -1,4 +1,6 @@
-"""Read a provider's error object, with whatever HTTP status it comes, and its requested waiting time.
+"""Read a provider's error object, and its requested waiting time.
+
+It may come with any HTTP status.
 
 One reader serves OpenAI, Anthropic, Gemini and the proxies and servers that copy them.
 """
@@ -62,7 +64,10 @@ class ProviderError:
 
     @property
     def is_about_key(self) -> bool:
-        """Whether a 401 or 403 with it is about the key, which is also assumed without words."""
+        """Whether a 401 or 403 with it is about the key.
+
+        This is also assumed without words.
+        """
         text = " ".join((self.message, *self.words)).replace("_", " ")
         return not text.strip() or bool(_ABOUT_KEY.search(text))
 
@@ -95,7 +100,10 @@ def read_error(content: bytes | None) -> ProviderError | None:
 
 
 def _is_flat(body: Mapping[str, Any]) -> bool:
-    """Return whether a body itself is an error object: a message with a code, and no field of an answer."""
+    """Return whether a body itself is an error object.
+
+    It then has a message with a code, and no field of an answer.
+    """
     return (
         isinstance(body.get("message"), str)
         and "code" in body
@@ -171,7 +179,10 @@ def _reset_s(named: Mapping[str, str], now: float) -> float | None:
 
 
 def _seconds(value: Any, now: float) -> float | None:
-    """Return the seconds from a number, an amount with units ("1m30s") or a date; None for anything else."""
+    """Return the seconds from a number, an amount with units or a date.
+
+    "1m30s" has units. None for anything else.
+    """
     text = str(value).strip() if isinstance(value, str | int | float) else ""
     try:
         number = float(text)

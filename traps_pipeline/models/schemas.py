@@ -7,7 +7,9 @@ from typing import Any
 
 
 def structured_output(name: str, **properties: Any) -> dict[str, Any]:
-    """Return the `response_format` of an object with exactly these properties, all of them required.
+    """Return the `response_format` of an object with exactly these properties.
+
+    All of them are required.
 
     properties: the JSON schema of each.
     """

@@ -1,4 +1,6 @@
-"""Shortcut rules: abstain by one cue, without understanding the void; the baseline that a model must beat.
+"""Abstain by one cue, without understanding the void.
+
+Such a rule is the baseline that a model must beat.
 
 A cue uses the clip or the question alone, never the record. Without its cue a rule gives the observer's answer, and if
 that has none the commonest answer of the sub-scenario: it abstains by its cue alone.
