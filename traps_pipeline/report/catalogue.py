@@ -71,7 +71,7 @@ class TableReport:
     @property
     def doc(self) -> str:
         """The caption."""
-        return _first_paragraph(self.make)
+        return _caption(self.make)
 
     @property
     def published(self) -> bool:
@@ -120,7 +120,7 @@ class FigureReport:
     @property
     def doc(self) -> str:
         """The caption."""
-        return _first_paragraph(self.make)
+        return _caption(self.make)
 
     def note(self, results: Results) -> str:
         """Return the finding about a study, with one sentence per model if it has one, and the caption."""
@@ -256,7 +256,7 @@ def _is_judged(reads: Sequence[str]) -> bool:
     return bool({*reads} & JUDGED_STAGES)
 
 
-def _first_paragraph(make: Callable[..., object]) -> str:
-    """Return the first paragraph of a docstring as a caption, without the verb `Return`."""
-    text = " ".join((make.__doc__ or "").split("\n\n")[0].split()).removeprefix("Return ")
+def _caption(make: Callable[..., object]) -> str:
+    """Return a docstring as a caption, without the verb `Return`."""
+    text = " ".join((make.__doc__ or "").split()).removeprefix("Return ")
     return text[:1].upper() + text[1:]
