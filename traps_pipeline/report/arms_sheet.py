@@ -1,4 +1,7 @@
-"""Contact sheets of one scenario with all its arms: the clip of each, and the right answer to it."""
+"""Draw contact sheets of one scenario with all its arms.
+
+Each arm has its clip, and the right answer to it.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +67,10 @@ def _moments(clip: Path) -> np.ndarray:
 
 
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
-    """Yield control and void, then the arms that must be answered, then those that must be abstained on."""
+    """Yield control and void, then the arms.
+
+    First those that must be answered, then those that must be abstained on.
+    """
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
     own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
     for row in (*pair.to_dict("records"), *own.to_dict("records")):
@@ -77,8 +83,9 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
-    """Return a figure with one row per clip: captions on the left, frames at the control's times, hatched after its
-    end.
+    """Return a figure with one row per clip.
+
+    Captions on the left, frames at the control's times, hatched after its end.
     """
     _, tall, wide, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * tall / wide + GAP_IN

@@ -1,4 +1,7 @@
-"""Findings of the leading mechanistic figures about a study, one sentence per model, from the figures' frames."""
+"""State findings of the leading mechanistic figures, one sentence per model.
+
+They come from the figures' frames.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,10 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 @_joined
 def states_and_output(results: Results) -> Iterator[str]:
-    """Return how many answered voids states and output classify as voids, and how well each orders the sides."""
+    """Return how many answered voids states and output classify as voids.
+
+    It also says how well each orders the sides.
+    """
     for model, of in _models(scored_items(results)):
         voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
         controls = of.loc[of["side"] == "control"]
@@ -56,7 +62,10 @@ def states_and_output(results: Results) -> Iterator[str]:
 
 @_joined
 def lens(results: Results) -> Iterator[str]:
-    """Yield how far the guided prompt moves the margin of each side at the last layer and at the one before."""
+    """Yield how far the guided prompt moves each side's margin at the last layers.
+
+    These are the last one and the one before.
+    """
     for model, of in _models(results.lens):
         means = of.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
@@ -79,7 +88,10 @@ def lens(results: Results) -> Iterator[str]:
 
 @_joined
 def probe_baselines(results: Results) -> Iterator[str]:
-    """Yield on how many pairs states beat every raw input, the margin and the noise; within and across datasets."""
+    """Yield on how many pairs states beat every raw input, the margin and the noise.
+
+    Pairs within and across datasets are counted apart.
+    """
     for model, of in _models(beside(results)):
         states, noise, spread = (of[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
         beaten = np.column_stack([of[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
@@ -93,7 +105,10 @@ def probe_baselines(results: Results) -> Iterator[str]:
 
 @_joined
 def gate_arrows(results: Results) -> Iterator[str]:
-    """Return the default gate's effect on PECS, and the best gate on features other than states."""
+    """Return the default gate's effect on PECS.
+
+    Beside it, the best gate on features other than states.
+    """
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     for model, of in _models(rows.loc[rows["pecs"].notna()]):
@@ -111,7 +126,10 @@ def gate_arrows(results: Results) -> Iterator[str]:
 
 @_joined
 def doses_among_nulls(results: Results) -> Iterator[str]:
-    """Return where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
+    """Return where void directions do more than 19 of 20 draws of every null.
+
+    Controls and voids are counted apart.
+    """
     rows = results.nulls
     for model, of in _models(rows.loc[rows["target"] != "all"]):
         cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -136,7 +154,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 @_joined
 def patching(results: Results) -> Iterator[str]:
-    """Return the group of positions with the largest effect at the first layer and at the last."""
+    """Return the position group with the largest effect at first and last layer."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     for model, of in _models(rows.loc[rows["group"] != "all"]):

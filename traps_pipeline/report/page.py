@@ -1,4 +1,7 @@
-"""The report page: findings, the leaderboard, the results, and a list of what was not run (docs/report.md)."""
+"""Render the report page (docs/report.md).
+
+Findings, the leaderboard, the results, and a list of what was not run.
+"""
 
 from __future__ import annotations
 

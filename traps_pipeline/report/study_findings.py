@@ -1,4 +1,7 @@
-"""A study's main findings, in sentences, for the top of its report page. Every number is in one of its tables."""
+"""State a study's main findings in sentences, for the top of its report page.
+
+Every number is in one of its tables.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,10 @@ class StudyFinding:
 
 
 def study_findings(results: Results) -> list[StudyFinding]:
-    """Return a study's findings, the most important first; of reference strategies only if no other model was asked."""
+    """Return a study's findings, the most important first.
+
+    Of reference strategies only if no other model was asked.
+    """
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):
@@ -46,7 +52,10 @@ def study_findings(results: Results) -> list[StudyFinding]:
 
 
 def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield the best model of each regime, and the number of others that the contrasts cannot separate from it."""
+    """Yield the best model of each regime.
+
+    It names how many others the contrasts cannot separate from it.
+    """
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
@@ -83,7 +92,10 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield how guided prompting changes Acc and AbsRec of the models with both regimes."""
+    """Yield how guided prompting changes Acc and AbsRec.
+
+    Only models with both regimes count.
+    """
     wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
     if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
         changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
@@ -95,7 +107,10 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield visual against textual voids, and the part of PECS that may come from shortcuts."""
+    """Yield visual against textual voids.
+
+    The part of PECS that may come from shortcuts follows.
+    """
     rates = results.rates
     pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
     pooled = pooled.dropna(subset=["visual", "textual"])
@@ -147,12 +162,15 @@ def _missing(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _span(shares: pd.Series) -> str:
-    """Return the smallest and the largest share in percent, once if they print the same."""
+    """Return the smallest and the largest share in percent.
+
+    Once if they print the same.
+    """
     low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _points(changes: pd.Series) -> str:
-    """Return the smallest and the largest change in percentage points, with their signs."""
+    """Return the smallest and the largest signed change in percentage points."""
     low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
     return low if low == high else f"{low} to {high}"

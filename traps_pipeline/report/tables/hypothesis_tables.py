@@ -26,7 +26,10 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 
 def hypotheses(results: Results) -> list[PrintedTable]:
-    """Return how answers and abstentions change as one property changes step by step, beside shortcut rules."""
+    """Return how answers and abstentions change as one property changes by steps.
+
+    Shortcut rules stand beside.
+    """
     from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]

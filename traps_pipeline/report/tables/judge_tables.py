@@ -1,4 +1,7 @@
-"""Tables of the judges' agreement and bias, of confabulation, and of its validation (docs/spec.md 4.4 and 6)."""
+"""Tabulate judges' agreement and bias, and confabulation.
+
+Its validation is here, too (docs/spec.md 4.4 and 6).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ if TYPE_CHECKING:
 
 
 def agreement(results: Results) -> list[PrintedTable]:
-    """Return the panel's agreement by dataset and task, and the lowest agreement of any two of its judges."""
+    """Return the panel's agreement by dataset and task.
+
+    The lowest agreement of any two of its judges stands beside.
+    """
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")

@@ -1,4 +1,7 @@
-"""Tables of a study's setup: models, their parameters, and the benchmark's composition (docs/spec.md 2 and 3)."""
+"""Tabulate a study's setup (docs/spec.md 2 and 3).
+
+Models, their parameters, and the benchmark's composition.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,10 @@ from traps_pipeline.storage.media import MediaSpec
 
 
 def models(results: Results) -> list[PrintedTable]:
-    """Return the evaluated models: provider, how a clip is shown, and the number of runs, from the registry."""
+    """Return the evaluated models, from the registry.
+
+    Each has its provider, how a clip is shown, and the number of runs.
+    """
     rows = []
     for entry in _entries(results):
         rows.append(
@@ -41,7 +47,10 @@ def _shown(media: MediaSpec | None) -> str:
 
 
 def hyperparameters(results: Results) -> list[PrintedTable]:
-    """Return the parameters that models and judges are sent, and where they depart from the protocol."""
+    """Return the parameters that models and judges are sent.
+
+    Departures from the protocol are marked.
+    """
     judges = [*load_judges().values()]
     if results.is_study:
         voted = set(results.bias["judge"])

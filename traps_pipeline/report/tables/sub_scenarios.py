@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 
 def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Return means over models of every occlusion sub-scenario, and the hidden ones compared with the others."""
+    """Return means over models of every occlusion sub-scenario.
+
+    The hidden ones are compared with the others.
+    """
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
     hidden = analyses.hidden_against_others(rows) if len(rows) else rows
@@ -44,7 +47,10 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Return means over models of every chaotic family, and Acc by the control's answer."""
+    """Return means over models of every chaotic family.
+
+    Acc by the control's answer follows.
+    """
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
     labels = with_titles(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
