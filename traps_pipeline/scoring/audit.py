@@ -1,4 +1,6 @@
-"""Recompute published values from other published values, and compare (`traps results audit`).
+"""Recompute published values from other published values, and compare.
+
+This is `traps results audit`.
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
 possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or
@@ -30,7 +32,10 @@ _AGREEING = (AGREES, ROUNDING)
 
 @dataclass(frozen=True)
 class AuditFinding:
-    """A published statement, the value recomputed from the published tables, and its line in the paper's source."""
+    """A published statement and its recomputed value, with its line in the source.
+
+    The value comes from the published tables; the source is the paper's.
+    """
 
     group: str
     statement: str
@@ -42,7 +47,10 @@ class AuditFinding:
 
 
 def audit() -> pd.DataFrame:
-    """Return every finding: columns group, statement, published, recomputed, verdict, reason, line."""
+    """Return every finding, one row each.
+
+    Columns: group, statement, published, recomputed, verdict, reason, line.
+    """
     groups: Sequence[Callable[[], Iterator[AuditFinding]]] = (
         claims,
         overall_means,
@@ -60,7 +68,9 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return the findings as text: every claim, every difference, and counts of the rest.
+    """Return the findings as text.
+
+    Every claim, every difference, and counts of the rest.
 
     everything: list the rest, too.
     """
@@ -79,7 +89,10 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def counts_text(findings: pd.DataFrame) -> str:
-    """Return a sentence with the numbers of statements that agree, differ as declared, and differ."""
+    """Return a sentence with the counts of statements by verdict.
+
+    They agree, differ as declared, or differ.
+    """
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
     agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
@@ -92,7 +105,10 @@ def counts_text(findings: pd.DataFrame) -> str:
 
 
 def claims() -> Iterator[AuditFinding]:
-    """Yield every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
+    """Yield every statement of `claims.csv`.
+
+    Raises KeyError for a statement whose arithmetic is not in `claims`.
+    """
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
         same = _same_words(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
@@ -105,7 +121,7 @@ def claims() -> Iterator[AuditFinding]:
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
-    """Return whether the numbers agree at the printed digits and both name the same things."""
+    """Return whether two texts agree at the printed digits and name the same things."""
     ours, theirs = _numbers(recomputed), _numbers(printed)
     if len(ours) != len(theirs):
         return False
@@ -114,7 +130,10 @@ def _same_words(printed: str, recomputed: str) -> bool:
 
 
 def _names(words: str) -> set[str]:
-    """Return the whole names in a text, so that a model's id is not found at the beginning of a longer id."""
+    """Return the whole names in a text.
+
+    So a model's id is not found at the beginning of a longer id.
+    """
     return set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", words))) - {"to", "and", "of"}
 
 
@@ -149,7 +168,10 @@ def _line(table: str) -> str:
 
 
 def overall_means() -> Iterator[AuditFinding]:
-    """Yield the overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
+    """Yield the overall leaderboard against means of the per-dataset table.
+
+    They have equal weights and are compared cell by cell.
+    """
     cells = published_cells()
     ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
     of_entry = dict(iter(cells.groupby(["model", "regime"])))
@@ -174,7 +196,9 @@ _REPLICATION = models_of(group="replication")
 
 
 def pecs_factors() -> Iterator[AuditFinding]:
-    """Yield PECS of every cell against its printed factors, within averaging and rounding errors.
+    """Yield PECS of every cell against its printed factors.
+
+    It must lie within averaging and rounding errors.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
     deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
@@ -210,7 +234,10 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
 
 
 def gaps() -> Iterator[AuditFinding]:
-    """Yield the printed gaps against the printed rates, each of which may have been rounded in its last digit."""
+    """Yield the printed gaps against the printed rates.
+
+    Each rate may have been rounded in its last digit.
+    """
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
@@ -232,7 +259,10 @@ def gaps() -> Iterator[AuditFinding]:
 
 
 def probe_means() -> Iterator[AuditFinding]:
-    """Yield the printed four-path means against the means of the printed pairs, each rounded in its last digit."""
+    """Yield the printed four-path means against the means of the printed pairs.
+
+    Each may have been rounded in its last digit.
+    """
     columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
     for row in published_rows("probe_means"):
         pairs = published_rows("probe_transfer", model=row["model"], transfer_type=row["transfer_type"])
@@ -281,7 +311,9 @@ def steering_means() -> Iterator[AuditFinding]:
 
 
 def steering_families() -> Iterator[AuditFinding]:
-    """Yield the regime table's figures over all paths against the means of its two source families of four paths.
+    """Yield the regime table's means over all paths against those of its families.
+
+    These are its two source families of four paths.
 
     The table does not name the prompt of the families' directions; the guided ones are assumed.
     """
@@ -303,8 +335,10 @@ def steering_families() -> Iterator[AuditFinding]:
 
 
 def validation_scores() -> Iterator[AuditFinding]:
-    """Yield F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last
-    digit."""
+    """Yield F1 of the confabulation judge against printed precision and recall.
+
+    Each may have been rounded in its last digit.
+    """
     for row in published("judge_validation").to_dict("records"):
         precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
         ours = _f1(precision, recall)
@@ -322,7 +356,10 @@ def _f1(precision: float, recall: float) -> float:
 
 
 def composition_sums() -> Iterator[AuditFinding]:
-    """Yield category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
+    """Yield category counts against the totals that the paper states.
+
+    These are 202 occlusion and 500 chaotic pairs.
+    """
     counts: dict[str, int] = {}
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
@@ -337,7 +374,10 @@ def composition_sums() -> Iterator[AuditFinding]:
 
 
 def contradictions() -> Iterator[AuditFinding]:
-    """Yield statements that contradict another place of the paper's text, where no arithmetic decides."""
+    """Yield statements that contradict another place of the paper's text.
+
+    No arithmetic decides which is right.
+    """
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
         yield AuditFinding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

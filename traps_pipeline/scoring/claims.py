@@ -1,4 +1,7 @@
-"""The arithmetic of every statement in `claims.csv`, from the published tables (`audit` compares the results)."""
+"""Compute every statement in `claims.csv` from the published tables.
+
+`audit` compares the results.
+"""
 
 from __future__ import annotations
 

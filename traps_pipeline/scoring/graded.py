@@ -1,4 +1,6 @@
-"""Score answers to graded cuts against the true distribution over answers (docs/scoring.md, "Graded cuts").
+"""Score answers to graded cuts against the true distribution over answers.
+
+See docs/scoring.md, "Graded cuts".
 
 A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns nothing. The expected points of an
 answer follow from the posterior of its cut, so no figure here depends on which of the futures was filmed.
@@ -47,7 +49,10 @@ class GradedItem:
     posterior: Mapping[str, float]
 
     def label_of(self, value: str | None) -> str | None:
-        """Return the answer that a value names, by the rules of correctness; None if it names none."""
+        """Return the answer that a value names, by the rules of correctness.
+
+        None if it names none.
+        """
         of = self.answer_type, self.labels, self.aliases
         return next((label for label in self.labels if is_correct(value, label, *of)), None)
 
@@ -76,7 +81,9 @@ class GradedItem:
         return {label: stated[label] / sum(stated.values()) for label in self.labels}
 
     def read_first_token(self, alternatives: object) -> dict[str, float] | None:
-        """Return each answer's probability from the log-probabilities of the first token; None without them.
+        """Return each answer's probability from the log-probabilities of the first token.
+
+        None without them.
 
         A token counts for the answer that it names, or for the only answer with a name that starts with it; the
         remaining probability is shared evenly.
@@ -105,7 +112,10 @@ def graded(
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> pd.DataFrame:
-    """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, given by id."""
+    """Return GRADED_CUTS rows of graded items, given by id.
+
+    They come from VERDICTS, VOTES and RESPONSES rows.
+    """
     labels, by_answer = _labels(votes, questions), responses.set_index(_ANSWER)
     texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
     rows = []
@@ -138,8 +148,9 @@ def _name(scope: int) -> str:
 
 
 def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tuple[Any, ...], str]:
-    """Return the answer of each response by more than half of its judges, "" for an answer that the item does not
-    offer.
+    """Return the answer of each response by more than half of its judges.
+
+    It is "" for an answer that the item does not offer.
 
     There is no entry without such a majority.
     """
@@ -176,7 +187,9 @@ def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> d
 
 
 def decided(item: GradedItem, label: str | None) -> dict[str, float]:
-    """Return the figures of one answer, or of an abstention (None): its expected points and its regret.
+    """Return the scores of one answer, or of an abstention (None).
+
+    They are its expected points and its regret.
 
     The regret is the loss against an ideal observer, with its reasons.
     """
@@ -222,7 +235,10 @@ def _commonest(posterior: Mapping[str, float]) -> str:
 
 
 def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, Any]:
-    """Return the figures of a model's and regime's items; a scenario counts once, with the mean over its runs."""
+    """Return the scores of a model's and regime's items.
+
+    A scenario counts once, with the mean over its runs.
+    """
     with_decision = items.loc[items["points"].notna()]
     of = with_decision.groupby("scenario_id")[_FIGURES].mean()
     row: dict[str, Any] = {
