@@ -1,4 +1,7 @@
-"""Copy a ledger verbatim: to a file, from a file, or into the database of several hosts."""
+"""Copy a ledger verbatim.
+
+It goes to a file, comes from a file, or goes into the database of several hosts.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +24,20 @@ _FETCHED = 1000
 
 
 def export_ledger(ledger: Database, file: Path) -> int:
-    """Write a ledger to a new SQLite file; return the number of rows. Raises TrapsError."""
+    """Write a ledger to a new SQLite file; return the number of rows.
+
+    Raises TrapsError.
+    """
     if file.exists():
         raise TrapsError(f"{file}: is there already; name another file")
     return copy_ledger(ledger, SqliteDatabase(file.parent, file=file.name))
 
 
 def import_ledger(file: Path, ledger: Database) -> int:
-    """Read the ledger of a file into a study that has none; return the number of rows. Raises TrapsError."""
+    """Read a file's ledger into a study that has none; return the number of rows.
+
+    Raises TrapsError.
+    """
     if not file.is_file():
         raise TrapsError(f"{file}: no such file; name one that `traps study export-ledger` wrote")
     source = SqliteDatabase(file.parent, file=file.name)
@@ -43,7 +52,9 @@ def import_ledger(file: Path, ledger: Database) -> int:
 
 
 def copy_ledger(source: Database, target: Database, settle: Callable[[], None] = lambda: None) -> int:
-    """Copy all rows and money verbatim, or none, while nobody writes to the source; return the number of rows.
+    """Copy all rows and money verbatim, or none, and return the number of rows.
+
+    Nobody may write to the source meanwhile.
 
     settle: called after the copy, before others may write. A killed copy is repeated. Raises TrapsError, also if the
     target has other rows.
