@@ -1,4 +1,4 @@
-"""Exchange answers with other systems, such as a cluster or a provider's batch mode.
+"""Exchange answers with other systems, as a cluster or a provider's batch mode.
 
 `export_requests` writes the missing requests as JSON lines, with their media by digest; `import_answers` reads answers
 with the same keys and makes the same checks. Both files are data: nothing in them is executed or used unchecked.
@@ -71,7 +71,7 @@ class Answer(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _outcome_follows_the_reason(cls, data: Any) -> Any:
-        """Take the outcome of a line that gives none from its finish reason: half a sentence is no answer."""
+        """Take a missing outcome from the finish reason: half a sentence is no answer."""
         if isinstance(data, dict) and "outcome" not in data and isinstance(data.get("finish_reason"), str):
             return data | {"outcome": OUTCOMES.get(ending_of(data["finish_reason"]), UNFINISHED)}
         return data
@@ -145,7 +145,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
 
 
 def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
-    """Return the experiment's cells whose datasets have items. Raises TrapsError if there is none.
+    """Return the experiment's cells whose datasets have items, or raise TrapsError.
 
     A study of one taxonomy has items of two of the four datasets.
     """
@@ -243,7 +243,7 @@ def import_answers(
 
 
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
-    """Return a message about texts that look like errors: their number, examples, and what to do."""
+    """Return a message about texts that look like errors, with number and examples."""
     examples = [f"{requested[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
     return (
         f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
@@ -254,7 +254,7 @@ def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mappin
 def export_request_batches(
     workspace: Workspace, experiment: Experiment, out: Path, media_at: str | None = None
 ) -> tuple[list[Path], int]:
-    """Write the experiment's missing requests as batch files; return the files and the number of calls.
+    """Write the experiment's missing requests as batch files; return files and calls.
 
     See `exchange.provider_batch.export_batches`.
     """
@@ -282,7 +282,7 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
 
 
 def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
-    """Import a batch of votes into their ledger; `traps run` then builds tables from them.
+    """Import a batch of votes into their ledger; `traps run` then builds tables.
 
     Raises TrapsError as `import_answers` does.
     """
@@ -322,7 +322,7 @@ def _import_batch(
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
-    """Return the answers of a file by key. Raises TrapsError naming (up to five) wrong or unwanted lines."""
+    """Return a file's answers by key; TrapsError names (up to five) wrong lines."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):
@@ -347,7 +347,7 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
 def _by_item(
     imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
-    """Return a harness's answers by key, and the number of its failed calls without an answer elsewhere.
+    """Return a harness's answers by key, and how many calls have no answer anywhere.
 
     Epochs of a harness are runs from `context.run` on. Raises TrapsError naming (up to five) wrong or unwanted answers.
     """
@@ -383,7 +383,7 @@ def _by_item(
 
 
 async def _store(workspace: Workspace, ledger: Ledger, stored: Sequence[_Stored]) -> int:
-    """Store the outcomes that the ledger lacks, all or none; return the number of new answers.
+    """Store the outcomes that the ledger lacks, all or none; return their number.
 
     A failed call is stored, too, and is asked again.
     """
