@@ -1,4 +1,7 @@
-"""A leaderboard of submissions: verify each, and rank those with the same items and panel together."""
+"""Rank submissions.
+
+Each is verified, and those with the same items and panel are ranked together.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,10 @@ class AcceptedSubmission:
 
     @property
     def group(self) -> tuple[str, str]:
-        """The digest of its items, and its panel: submissions with the same group are ranked together."""
+        """The digest of its items, and its panel.
+
+        Submissions with the same group are ranked together.
+        """
         items = self.submission.table(ITEMS)
         about = self.submission.about
         return digest(sorted(items["item_hash"]))[:16], id_of_judges(about.panel, about.judges)
@@ -56,7 +62,10 @@ class RefusedSubmission:
 
 @dataclass(frozen=True)
 class RankedGroup:
-    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission if names repeat."""
+    """Entries that are ranked together.
+
+    LEADERBOARD rows, of models named model@submission if names repeat.
+    """
 
     items: str
     panel: str
@@ -81,7 +90,10 @@ class Board:
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
-    """Verify submissions and rank the valid ones. Raises TrapsError if two have one name, and if none is valid."""
+    """Verify submissions and rank the valid ones.
+
+    Raises TrapsError if two have one name, and if none is valid.
+    """
     board = Board()
     for path in paths:
         try:
@@ -111,7 +123,10 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
 
 
 def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> RankedGroup:
-    """Return the members' verdicts scored together, so that their differences are paired over the same scenarios."""
+    """Return the members' verdicts scored together.
+
+    Their differences are then paired over the same scenarios.
+    """
     owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
     for one in members:

@@ -1,4 +1,6 @@
-"""Verify a submission: recast its votes if that needs no key, recompute every number, and compare with a release.
+"""Verify a submission.
+
+Its votes are recast if that needs no key, every number is recomputed, and it is compared with a release.
 
 Items, prompts and media are compared with the release's. The result names what cannot be checked.
 """
@@ -69,7 +71,10 @@ class Verification:
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verification:
-    """Verify a submission, against a released folder if given. Raises TrapsError for an unreadable release."""
+    """Verify a submission, against a released folder if given.
+
+    Raises TrapsError for an unreadable release.
+    """
     verified = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
@@ -118,7 +123,10 @@ def _wrong_prompts(submission: Submission) -> Iterator[str]:
 
 
 def released_items(release: Path) -> dict[str, tuple[str, str]]:
-    """Return digests of item and clip by released item. Raises TrapsError, also for an altered folder."""
+    """Return digests of item and clip by released item.
+
+    Raises TrapsError, also for an altered folder.
+    """
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
 
@@ -233,7 +241,10 @@ def _cast_again(task: str, user: str) -> Outcome:
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from the correct one; an item with a wrong kind decides nothing."""
+    """Return how a vote differs from the correct one.
+
+    An item with a wrong kind decides nothing.
+    """
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:
@@ -264,7 +275,10 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _numbers(verified: Verification, submission: Submission) -> None:
-    """Compute verdicts, metrics and leaderboard from the votes; record how the submission's numbers differ."""
+    """Compute verdicts, metrics and leaderboard from the votes.
+
+    Record how the submission's numbers differ.
+    """
     own = id_of_judges(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
