@@ -30,14 +30,19 @@ RESAMPLES, HALVINGS = 200, 50
 
 @dataclass(frozen=True, eq=False)
 class PairDifferences:
-    """Void minus control state of each pair of a direction, (n, d), and the scenario number of each pair, (n,)."""
+    """Void minus control state of each pair of a direction, (n, d).
+
+    The scenario number of each pair is (n,).
+    """
 
     values: np.ndarray
     scenario: np.ndarray
 
 
 def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the mean product of pairs of different scenarios, (draws,): an unbiased product of two mean differences.
+    """Return the mean product of pairs of different scenarios, (draws,).
+
+    It is an unbiased product of two mean differences.
 
     weights: (draws, scenarios), the count of each scenario.
     """
@@ -49,7 +54,9 @@ def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> 
 
 
 def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the cosine of two mean differences without the noise of their pairs, (draws,).
+    """Return the cosine of two mean differences, corrected for noise, (draws,).
+
+    The noise is that of their pairs.
 
     It may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
@@ -59,7 +66,10 @@ def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndar
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
-    """Return the cosine between directions of two halves of the pairs, averaged over random halvings."""
+    """Return the cosine between directions of two halves of the pairs.
+
+    It is averaged over random halvings.
+    """
     products, n = of.values @ of.values.T, len(of.values)
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
@@ -132,7 +142,10 @@ def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) 
 
 
 def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
-    """Return each scenario's count, (1 + RESAMPLES, scenarios): first 1, then resampled within its taxonomy."""
+    """Return each scenario's count, (1 + RESAMPLES, scenarios).
+
+    The first are 1, the others resampled within its taxonomy.
+    """
     weights, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
         if n := int(np.count_nonzero(of == taxonomy)):

@@ -1,4 +1,7 @@
-"""Detect degenerate steered texts, which a judge could call either abstention or answer."""
+"""Detect degenerate steered texts.
+
+A judge could call one either abstention or answer.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,9 @@ def repeats(text: str) -> bool:
 
 
 def script(text: str) -> str:
-    """Return the script of most letters, by the first word of their Unicode names (LATIN, CJK, CYRILLIC); empty for a
-    text without letters."""
+    """Return the script of most letters; empty for a text without letters.
+
+    It is the first word of their Unicode names (LATIN, CJK, CYRILLIC).
+    """
     names = Counter(unicodedata.name(letter, "?").split()[0] for letter in text if letter.isalpha())
     return names.most_common(1)[0][0] if names else ""

@@ -63,7 +63,10 @@ def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def layer_margins(model: LocalModel, states: Any, tokens: list[int]) -> np.ndarray:
-    """Return the margins (n,) of a block's output states (n, d), through the final norm and the head."""
+    """Return the margins (n,) of a block's output states (n, d).
+
+    They pass through the final norm and the head.
+    """
     import torch
 
     with torch.inference_mode():

@@ -24,7 +24,9 @@ _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
 def begins_abstention(token: str) -> bool:
-    """Return whether a token's text begins an abstention: with a phrase of PHRASES, or the first word of one.
+    """Return whether a token's text begins an abstention.
+
+    It begins with a phrase of PHRASES, or the first word of one.
 
     "I" counts, although other sentences begin with it too: the margin is a lower bound of the information in the first
     token.
@@ -34,7 +36,10 @@ def begins_abstention(token: str) -> bool:
 
 
 def abstention_tokens(model: LocalModel) -> list[int]:
-    """Return the tokens of a model's vocabulary that begin an abstention. Raises TrapsError if there is none."""
+    """Return the tokens of a model's vocabulary that begin an abstention.
+
+    Raises TrapsError if there is none.
+    """
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
     tokens = [token for token, text in enumerate(texts) if begins_abstention(text)]
@@ -47,7 +52,10 @@ def abstention_tokens(model: LocalModel) -> list[int]:
 
 
 def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
-    """Return the log-odds of `tokens` against all others except `never`, from logits (.., vocabulary): (..)."""
+    """Return the log-odds of `tokens` against all others except `never`.
+
+    logits (.., vocabulary) -> (..).
+    """
     import torch
 
     chosen = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
@@ -60,7 +68,9 @@ def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) 
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
-    """Return the margins (n,) of normed states (n, d) at a prompt's last position, on the CPU.
+    """Return the margins (n,) of normed states (n, d), on the CPU.
+
+    They are those at a prompt's last position.
 
     Gradients pass: `patching_effects.attributed_changes` needs them.
     """

@@ -1,4 +1,6 @@
-"""The backend of steered requests: a local model that answers with a direction added to one block.
+"""Answer steered requests on a local model.
+
+A direction is added to the output of one block.
 
 Requests of one layer are generated together; answers that another process of the machine has generated are reused
 (`shared_answers`).
@@ -26,7 +28,10 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block; each row has its own direction and alpha."""
+    """A local model that answers with a direction added to one block.
+
+    Each row has its own direction and alpha.
+    """
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
         super().__init__(entry)
@@ -38,7 +43,9 @@ class SteeredBackend(LocalBackend):
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        """Answer requests; rows of one layer are generated together, and unsteered rows apart.
+        """Answer requests in groups.
+
+        Rows of one layer are generated together, and unsteered rows apart.
 
         stopped: called at every token, ends generation early.
         """

@@ -1,4 +1,4 @@
-"""Steering: the answers of each cell, their generation, and the panel's votes on them (docs/spec.md 8).
+"""Steer models (docs/spec.md 8): answers, their generation, and votes on them.
 
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
@@ -127,7 +127,9 @@ Dose = tuple[str, float]  # unit and number
 
 
 def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return the doses of a direction, except those in class gaps beyond `cap` control states.
+    """Return the doses of a direction within the cap.
+
+    Left out are those in class gaps beyond `cap` control states.
 
     A null has only the largest one.
     """
@@ -137,7 +139,10 @@ def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[D
 
 
 class _Planned(NamedTuple):
-    """A direction along which a target is steered, with sides and doses; a null has only the largest dose."""
+    """A direction along which a target is steered, with sides and doses.
+
+    A null has only the largest dose.
+    """
 
     source: str
     kind: str
@@ -170,7 +175,9 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """Return the number of answers that steering a model needs, by inference regime and side.
+    """Return the number of answers that steering a model needs.
+
+    By inference regime and side.
 
     An answer that cells share counts once. scenarios: their number by taxonomy.
     """
@@ -209,7 +216,10 @@ def wanted_steered(
     cell: SteeringCell,
     directions: Mapping[str, Directions],
 ) -> list[SteeredQuestion]:
-    """Return the calls for every answer of a cell, those with the same prompt together, to share its clip."""
+    """Return the calls for every answer of a cell.
+
+    Those with the same prompt come together, to share its clip.
+    """
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -234,7 +244,10 @@ def steered_request(
     strength: Strength,
     max_new_tokens: int,
 ) -> Request:
-    """Return the call for one steered answer: the full benchmark prompt, greedy, in the precision of extraction."""
+    """Return the call for one steered answer.
+
+    The full benchmark prompt, greedy, in the precision of extraction.
+    """
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
@@ -256,7 +269,10 @@ def steered_request(
 
 
 def shared_item(item: Mapping[str, Any]) -> str:
-    """Return the item's id in the ledger: a control is one item in both datasets of its taxonomy."""
+    """Return the item's id in the ledger.
+
+    A control is one item in both datasets of its taxonomy.
+    """
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
@@ -346,7 +362,9 @@ def _steering_row(
 def collect_steering_votes(
     workspace: Workspace, cells: Sequence[SteeringCell]
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
-    """Ask the study's panel whether each steered answer abstains and whether a control's is correct.
+    """Ask the panel whether each steered answer abstains or is correct.
+
+    Correctness is asked of controls.
 
     Yields the STEERING_VOTES rows of each finished cell.
     """
