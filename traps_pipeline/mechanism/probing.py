@@ -1,6 +1,4 @@
-"""Probe every pair of datasets at every layer (docs/spec.md 7).
-
-This is the probing protocol; its rows are the `probes` table.
+"""Probe every pair of datasets at every layer: rows of `probes` (docs/spec.md 7).
 
 Layers are read one at a time: at the 8B size one layer of all items takes 46 MB, all of them 1.7 GB.
 """
@@ -55,19 +53,14 @@ class NothingConfabulated(TrapsError):
 
 @dataclass(frozen=True)
 class Confabulated:
-    """By dataset, the scenarios on whose void item the model confabulated.
-
-    Or the reason for a missing entry.
-    """
+    """The scenarios with a confabulated void, by dataset, or why one is missing."""
 
     scenarios: Mapping[str, frozenset[str]]
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
 def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> frozenset[str]:
-    """Return the scenarios on whose void item the model did not abstain.
-
-    Undecided items are left out.
+    """Return the scenarios on whose void the model did not abstain, if decided.
 
     verdicts: those of the dataset under Standard in run 1. Raises NothingConfabulated if there is no such scenario.
     """
@@ -175,19 +168,14 @@ class ProbeRun:
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the same pairs restricted to confabulated voids and their controls.
-
-        Source and target are restricted alike.
-        """
+        """Return the same pairs restricted to confabulated voids and their controls."""
         restricted = self._confabulated(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
         scores = transfer_scores(restricted, pairs, self.fit)
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the `confabulated_transfer` pairs with shared controls, held out.
-
-        Probes are fitted without the scored scenario.
+        """Return such pairs with shared controls, by probes that hold out the scenario.
 
         A pair has no figure if too few scenarios are left to split.
         """
@@ -208,10 +196,7 @@ class ProbeRun:
         return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
 
     def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
-        """Return why a source's probes cannot hold out a fold; empty if they can.
-
-        It is a fold of scenarios.
-        """
+        """Return why a source's probes cannot hold out a fold of scenarios, if so."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
@@ -219,19 +204,13 @@ class ProbeRun:
         return f"{path_name(*splits)}, held out: {n} confabulated voids are too few for {folds} folds of scenarios"
 
     def _folds(self, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Return the fold of each item, by dataset.
-
-        A scenario has one fold in all of them.
-        """
+        """Return the fold of each item, by dataset; a scenario's fold is the same in all."""
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
         return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return grouped cross-validation within each dataset.
-
-        Labels are the true and swapped ones.
-        """
+        """Return cross-validation within each dataset, with true and swapped labels."""
         rows = []
         for name in self._own:
             split = splits[name]
@@ -246,19 +225,14 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return the pairs within a taxonomy, by probes that hold out the scenario.
-
-        A dataset on itself is a pair, too.
-        """
+        """Return the pairs within a taxonomy, by probes that hold out the scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
         return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return answerable clips that resemble voids, with scores.
-
-        The probes of each dataset score them.
+        """Return answerable clips that resemble voids, scored by each dataset's probes.
 
         These are void clips with an answerable question, decoys (an occluder that hides nothing), and whole clips as
         short as a void. answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have
@@ -284,9 +258,7 @@ class ProbeRun:
     def time_swapped(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return AUROC on chaotic's frames with the other side's times.
-
-        Labels are by the frames.
+        """Return AUROC on chaotic's frames with the other side's times, by the frames.
 
         It is 1 for a probe that reads the frames, 0 for one that reads the time stamps.
         """
@@ -324,8 +296,6 @@ class ProbeRun:
     def centroids(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
         """Return shares of items that the source's nearest centroid assigns to void.
 
-        They are of each target's items, by sub-scenario.
-
         The centroids of a taxonomy's two datasets come from the same controls, so these shares are too low for
         controls; `baselines` has the same of noise.
         """
@@ -349,10 +319,7 @@ class ProbeRun:
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
 
     def _problems(self) -> list[Row]:
-        """Return a row with the reason for each Cf->Cf pair without a score.
-
-        It cannot be computed.
-        """
+        """Return a row with the reason for each Cf->Cf pair without a score."""
         rows = []
         for source, target in self._pairs:
             reasons = [self.confabulated.problems[n] for n in (source, target) if n in self.confabulated.problems]
