@@ -1,4 +1,4 @@
-"""The one way to hash a value: SHA-256 of canonical JSON."""
+"""Hash values as SHA-256 of canonical JSON, everywhere in the same way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of a run, and the events that change it.
+"""Hold the state of a run, and the events that change it.
 
 Library code reports to `current()`. A command installs a subclass that prints (`cli/printed_progress.py`), and a
 Dagster step adds a listener (`Progress.heard_by`).

@@ -1,4 +1,4 @@
-"""A fake provider on this machine that records the requests of an entry's backend."""
+"""Run a fake provider on this machine that records a backend's requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`traps init`: create the workspace of an experiment."""
+"""Create the workspace of an experiment (`traps init`)."""
 
 from __future__ import annotations
 

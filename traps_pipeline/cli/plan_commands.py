@@ -1,4 +1,4 @@
-"""`traps plan`: print the calls that an experiment would make, and their cost."""
+"""Print an experiment's calls and their cost (`traps plan`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`traps run`: materialize every missing or stale partition of an experiment."""
+"""Materialize an experiment's missing or stale partitions (`traps run`)."""
 
 from __future__ import annotations
 

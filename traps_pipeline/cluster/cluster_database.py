@@ -1,4 +1,4 @@
-"""Leases in the database that holds the study's ledger."""
+"""Take leases in the database that holds the study's ledger."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study's files in an object store (S3, Google, Azure), for several hosts.
+"""Store a study's files in an object store (S3, Google, Azure), for several hosts.
 
 An object is written once, under the SHA-256 of its content, and never renamed; `object_names.py` maps paths to objects.
 A host caches what it has fetched in its scratch folder, below `.objects` under the same digests, and links it to the

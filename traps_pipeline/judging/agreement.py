@@ -1,4 +1,4 @@
-"""Agreement between judges, and the bias of each (docs/spec.md 4.4).
+"""Measure agreement between judges, and the bias of each (docs/spec.md 4.4).
 
 Everything is counted per dataset and task over all models, regimes and runs. An undefined coefficient is null, with the
 reason: if all votes are of one class, agreement beyond chance is undefined.

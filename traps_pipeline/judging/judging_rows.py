@@ -1,4 +1,4 @@
-"""The tables of judging: votes, verdicts, agreement of judges, confabulation."""
+"""Define the tables of judging: votes, verdicts, agreement, confabulation."""
 
 from dataclasses import dataclass
 from typing import Annotated

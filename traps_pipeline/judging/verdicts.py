@@ -1,4 +1,4 @@
-"""Verdicts: the majority decision of the panel on every answer (docs/spec.md 4.1)."""
+"""Decide every answer by the panel's majority (docs/spec.md 4.1)."""
 
 from __future__ import annotations
 

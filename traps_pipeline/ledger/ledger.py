@@ -1,4 +1,4 @@
-"""The append-only ledger of calls: each is paid for once.
+"""Append calls to the ledger, so that each is paid for once.
 
 Answers (and votes) are rows, appended as they arrive and before anything counts them as done. An evaluation has one
 writer at a time.

@@ -1,4 +1,4 @@
-"""Rows of the ledger: possible values, settled keys, and totals.
+"""Interpret rows of the ledger: possible values, settled keys, and totals.
 
 A value that no table can hold, or that no call can have cost, is unknown. A provider's slip can thus neither keep a
 table from being built nor end a study.

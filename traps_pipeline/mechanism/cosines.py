@@ -1,4 +1,4 @@
-"""Cosines of void directions, corrected for few pairs and shared controls.
+"""Compute cosines of void directions, corrected for few pairs and shared controls.
 
 A direction is a mean over pairs, so its noise makes its cosine with any other direction too small, and if two datasets
 have the same controls, their common noise makes it too large. Products of *different* scenarios have neither: the

@@ -1,4 +1,4 @@
-"""The output margin by layer: a logit lens on stored states.
+"""Compute the output margin by layer: a logit lens on stored states.
 
 Without any pass, the stored states go through the model's own final norm and head. At the last layer the result is the
 output margin itself. The curve shows at which layer a prompt decides whether a void is answered.

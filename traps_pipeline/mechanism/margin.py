@@ -1,4 +1,4 @@
-"""The output margin: the log-odds that a model's answer begins with an abstention.
+"""Compute the output margin: log-odds that an answer begins with an abstention.
 
 It is computed from the first answer token: the log-odds of the tokens that begin an abstention against all others. A
 probe says something about a gap between representation and output only as far as it separates better than this.

@@ -1,4 +1,4 @@
-"""The tables of the mechanistic stages (docs/spec.md 7 and 8)."""
+"""Define the tables of the mechanistic stages (docs/spec.md 7 and 8)."""
 
 from dataclasses import dataclass
 from typing import Annotated

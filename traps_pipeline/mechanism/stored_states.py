@@ -1,4 +1,4 @@
-"""The hidden states of a study, read layer by layer in the order of their table."""
+"""Read a study's hidden states layer by layer, in the order of their table."""
 
 from __future__ import annotations
 

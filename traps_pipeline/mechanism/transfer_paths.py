@@ -1,4 +1,4 @@
-"""Ordered pairs of datasets, and their transfer types (docs/spec.md 7.2 and 8.3)."""
+"""List ordered pairs of datasets with transfer types (docs/spec.md 7.2 and 8.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A cap that holds: the worst case of a call is reserved before it is sent.
+"""Cap spending: the worst case of a call is reserved before it is sent.
 
 The reservation is a row of the ledger's database, and the call's own row replaces it (`ledger/money.py`). So calls in
 flight when a process is killed count as their worst case forever, and all processes of a study share one budget.

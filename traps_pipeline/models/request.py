@@ -1,4 +1,4 @@
-"""The two values that every backend speaks: `Request -> Outcome`."""
+"""Define the two values that every backend speaks: `Request -> Outcome`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON schemas of the objects that providers are asked for (structured output)."""
+"""Define JSON schemas of the objects asked of providers (structured output)."""
 
 from __future__ import annotations
 

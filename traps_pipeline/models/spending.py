@@ -1,4 +1,4 @@
-"""The budget of a run: what a study and its accounts leave, while the run goes on."""
+"""Share what a study and its accounts leave to spend, while the run goes on."""
 
 from __future__ import annotations
 

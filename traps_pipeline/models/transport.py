@@ -1,4 +1,4 @@
-"""The record of one attempt on the wire.
+"""Record one attempt on the wire.
 
 The transport (`models/wire.py`) writes it below the client libraries, which turn malformed answers into errors that
 look unbilled.

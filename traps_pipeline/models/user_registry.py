@@ -1,4 +1,4 @@
-"""User-defined models, judges and panels, which need no change of a tracked file.
+"""Add users' models, judges and panels without changing a tracked file.
 
 They are defined in an experiment's YAML, and copied to `own.yaml` of the workspace in which it runs. An entry has the
 registry's fields and may be short: an address, and the form of clips that the server takes. The protocol supplies the

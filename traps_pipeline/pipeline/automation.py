@@ -1,4 +1,4 @@
-"""Dagster jobs for parts of the study, and sensors that follow corrections.
+"""Define Dagster jobs for parts of the study, and sensors that follow corrections.
 
 A job materializes the missing or stale partitions of its stages that the study's experiments want. Dagster cannot run
 assets of different partitions in one job, so a job whose stages have several is one op, which starts a run for each

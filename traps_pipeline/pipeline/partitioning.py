@@ -1,4 +1,4 @@
-"""Partitioning schemes, and mappings between partitions, without Dagster.
+"""Define partitioning schemes, and mappings between partitions, without Dagster.
 
 Importing Dagster takes longer than `traps status`; `pipeline.translation` translates these classes into Dagster's.
 """

@@ -1,4 +1,4 @@
-"""Decorators that declare a stage or a source.
+"""Declare a stage or a source by a decorator.
 
 `@stage(TABLE, ...)` declares that a function makes a table (or files for people), `@source(...)` that one returns the
 version of something that people edit. `pipeline.assets` builds Dagster's assets from them, `pipeline.step` their

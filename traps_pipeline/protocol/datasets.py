@@ -1,4 +1,4 @@
-"""Datasets, arms and variations: their names, their sides, and their categories."""
+"""Name datasets, arms and variations, their sides, and their categories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study's own results, from the tables of its workspace."""
+"""Read a study's own results from the tables of its workspace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's analyses: tidy frame of cells in, tidy frame out (docs/spec.md 5.4).
+"""Compute the paper's analyses, from cells to a tidy frame (docs/spec.md 5.4).
 
 `cells` has one row per (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
 abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it from a study, `published.published_cells` from

@@ -1,4 +1,4 @@
-"""The tables of figures: metrics of cells, comparisons, the leaderboard."""
+"""Define the tables of scores: metrics of cells, comparisons, the leaderboard."""
 
 from dataclasses import dataclass
 from typing import Annotated

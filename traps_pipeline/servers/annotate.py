@@ -1,4 +1,4 @@
-"""`traps people annotate`: people label clips and answers blindly, one per screen.
+"""Let people label clips and answers blindly, one a screen (`people annotate`).
 
 Only the server knows the identity of the shown unit. A browser gets a question, a clip or an answer, and a handle made
 for one person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.

@@ -1,4 +1,4 @@
-"""The queues of a review: which scenarios are shown, and in which order."""
+"""Queue the scenarios of a review: which are shown, and in which order."""
 
 from __future__ import annotations
 

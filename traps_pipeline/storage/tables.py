@@ -1,4 +1,4 @@
-"""What a table is: an annotated frozen dataclass, of which one value is one row.
+"""Declare tables as annotated frozen dataclasses, of which one value is one row.
 
     @dataclass(frozen=True, kw_only=True)
     class VideoRow:

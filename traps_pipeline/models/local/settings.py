@@ -1,4 +1,4 @@
-"""A local model's settings in the registry, without heavy imports."""
+"""Define a local model's settings in the registry, without heavy imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark group: specs, clips, items."""
+"""Declare the benchmark group: specs, clips, items."""
 
 from collections import Counter
 from collections.abc import Callable

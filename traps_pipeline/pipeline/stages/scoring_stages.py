@@ -1,4 +1,4 @@
-"""The scoring group: metrics of cells, contrasts, the leaderboard."""
+"""Declare the scoring group: metrics of cells, contrasts, the leaderboard."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A study's answers, decisions and votes in the explorer's order.
+"""Order a study's answers, decisions and votes as the explorer shows them.
 
 Every answer has a row: sorted by item, then by evaluation. Items are sorted so that those of a pair, and the pairs of a
 family, follow each other; a shard holds the texts and votes of consecutive pairs, so that a page of one pair needs one

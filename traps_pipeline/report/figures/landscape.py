@@ -1,4 +1,4 @@
-"""Models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
+"""Draw models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of the paper's untested assumptions, dose by dose (docs/hypotheses.md)."""
+"""Tabulate the paper's untested assumptions, dose by dose (docs/hypotheses.md)."""
 
 from __future__ import annotations
 

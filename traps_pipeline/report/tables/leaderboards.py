@@ -1,4 +1,4 @@
-"""Leaderboards: overall and by dataset (docs/spec.md 5.2 and 10)."""
+"""Tabulate leaderboards, overall and by dataset (docs/spec.md 5.2 and 10)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Indirect effects of activation patching, beside their nulls."""
+"""Tabulate indirect effects of activation patching, beside their nulls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of directions and steering (docs/spec.md 8)."""
+"""Tabulate directions and steering (docs/spec.md 8)."""
 
 from __future__ import annotations
 

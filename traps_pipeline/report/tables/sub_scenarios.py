@@ -1,4 +1,4 @@
-"""Tables of sub-scenarios of both taxonomies (docs/spec.md 2.2 and 5.4)."""
+"""Tabulate sub-scenarios of both taxonomies (docs/spec.md 2.2 and 5.4)."""
 
 from __future__ import annotations
 

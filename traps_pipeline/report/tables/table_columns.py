@@ -1,4 +1,4 @@
-"""Columns and sentences that many tables share."""
+"""Share columns and sentences between tables."""
 
 from __future__ import annotations
 
