@@ -129,8 +129,12 @@ def certificate_problem(variables: Sequence[str]) -> str | None:
 
 def _certificates_problem(variable: str, value: str) -> str:
     if variable == "SSL_CERT_DIR":
-        gone = [folder for folder in value.split(os.pathsep) if not Path(folder).is_dir()]
-        return f"{variable} names the folder {gone[0]}, which is not there: mend or unset it" if gone else ""
+        missing_folders = [folder for folder in value.split(os.pathsep) if not Path(folder).is_dir()]
+        return (
+            f"{variable} names the folder {missing_folders[0]}, which is not there: mend or unset it"
+            if missing_folders
+            else ""
+        )
     if not Path(value).exists():
         return f"{variable} names the file {value}, which is not there: mend or unset it"
     try:

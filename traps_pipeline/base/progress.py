@@ -101,16 +101,20 @@ class StageProgress:
     def left_s(self) -> float | None:
         """Seconds until the stage ends at its pace so far; None before anything is known."""
         total = self.total()
-        begun = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
-        return self.seconds / begun * max(self.partitions - begun, 0.0) if begun and self.partitions else None
+        begun_calls = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
+        return (
+            self.seconds / begun_calls * max(self.partitions - begun_calls, 0.0)
+            if begun_calls and self.partitions
+            else None
+        )
 
     def total(self) -> Traffic:
         """Return the sum of all calls."""
         each = [*self.calls.values()]
-        total = Traffic(began=min((one.began for one in each), default=self.began))
-        total.latencies = deque(chain.from_iterable([*one.latencies] for one in each))
+        total = Traffic(began=min((traffic.began for traffic in each), default=self.began))
+        total.latencies = deque(chain.from_iterable([*traffic.latencies] for traffic in each))
         for name in ("wanted", "cached", "done", "errors", "retries", "dollars"):
-            setattr(total, name, sum(getattr(one, name) for one in each))
+            setattr(total, name, sum(getattr(traffic, name) for traffic in each))
         return total
 
     def work(self) -> list[str]:
@@ -165,8 +169,8 @@ class Progress:
             self.current_stage = StageProgress(stage, 0)
         self.current_stage.cells += 1
         self.current_stage.detail, self.current_stage.share = "", 0.0
-        for who, (missing, known) in calls.items():
-            traffic = self.current_stage.calls.setdefault(who, Traffic())
+        for participant, (missing, known) in calls.items():
+            traffic = self.current_stage.calls.setdefault(participant, Traffic())
             traffic.wanted, traffic.cached = traffic.wanted + missing, traffic.cached + known
         self.changed()
 
@@ -232,7 +236,7 @@ class Progress:
         if (now := self.current_stage) is None:
             return money
         times = {"seconds": round(now.seconds, 1), "left_s": None if now.left_s is None else round(now.left_s, 1)}
-        calls = {who: traffic.figures() for who, traffic in [*now.calls.items()]}
+        calls = {participant: traffic.figures() for participant, traffic in [*now.calls.items()]}
         counts = {"stage": now.name, "done": now.done, "partitions": now.partitions, "detail": now.detail}
         return {**counts, **times, **money, "calls": calls}
 

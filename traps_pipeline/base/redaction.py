@@ -214,7 +214,7 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
 
 def _alike(text: str, other: str) -> int:
     """Return how many characters two texts have in common at their beginnings."""
-    differing = (k for k, (one, two) in enumerate(zip(text, other, strict=False)) if one != two)
+    differing = (k for k, (char, other_char) in enumerate(zip(text, other, strict=False)) if char != other_char)
     return next(differing, min(len(text), len(other)))
 
 

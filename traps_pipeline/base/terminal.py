@@ -76,8 +76,8 @@ def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None)
     for line in text.split("\n"):
         indent = len(line) - len(line.lstrip())
         further = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
-        how: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
-        lines.append(textwrap.fill(line, columns, **how))
+        options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
+        lines.append(textwrap.fill(line, columns, **options))
     return "\n".join(lines)
 
 

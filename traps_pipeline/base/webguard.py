@@ -129,8 +129,8 @@ class Guard:
         refused = self._refusal(scope, headers)
         if refused is None and scope["type"] == "http" and self._token_in(scope):
             await self._enter(scope, send)
-        elif refused is None and (who := self._whose(headers)) is not None:
-            scope[WHO] = who
+        elif refused is None and (person := self._whose(headers)) is not None:
+            scope[WHO] = person
         elif refused is None:
             refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
         if refused is not None:
@@ -175,9 +175,9 @@ class Guard:
         It is compared with every token, so that timing reveals nothing.
         """
         owner = None
-        for token, who in self._tokens.items():
+        for token, person in self._tokens.items():
             if token_given is not None and hmac.compare_digest(token_given.encode(), token.encode()):
-                owner = who
+                owner = person
         return owner
 
     def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
