@@ -58,10 +58,12 @@ def certify_all(
         for case in cases:
             case.verdict.unlink(missing_ok=True)
     verdicts = []
-    for done, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
+    for finished, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
         verdicts.append(verdict)
-        if not verdict.passed or done % 20 == 0 or done == len(cases):
-            report(f"{done} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
+        if not verdict.passed or finished % 20 == 0 or finished == len(cases):
+            report(
+                f"{finished} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}"
+            )
     failures = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
@@ -160,10 +162,10 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     for family, mine in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in mine)
         rejected = tallies.get(family, Tally(0, 0)).rejected.total()
-        others = sum(not v.same_physics for v in mine)
+        changed = sum(not v.same_physics for v in mine)
         spans = (_span(mine, "entropy_bits", 2), _span(mine, "top_share", 2), _span(mine, "margin_m", 3))
         seconds = f"{np.median([v.cpu_s for v in mine]):.1f}"
-        rows.append((family, len(mine), sum(v.passed for v in mine), rejected, *spans, twins, seconds, others))
+        rows.append((family, len(mine), sum(v.passed for v in mine), rejected, *spans, twins, seconds, changed))
     lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(

@@ -159,8 +159,8 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
             scenarios[correction.scenario_id] = _restored(where, correction.scenario_id, released)
             continue
         if known is None:
-            gone = "was discarded" if correction.scenario_id in released else "is unknown"
-            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {gone}; name a scenario of the benchmark")
+            state = "was discarded" if correction.scenario_id in released else "is unknown"
+            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":

@@ -73,8 +73,8 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
         if not is_reviewed(own):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
         released = load_released()
-        others = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
-        before = fold(released, [*others, *(("before", each) for each in own[:-1])]).get(scenario_id)
+        other_decisions = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
+        before = fold(released, [*other_decisions, *(("before", each) for each in own[:-1])]).get(scenario_id)
 
         def signed(action: str, **changes: Any) -> Correction:
             about = {"who": who, "when": date.today(), "why": why}

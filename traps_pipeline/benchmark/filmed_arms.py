@@ -144,7 +144,9 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
         (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
         (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
     )
-    return [one for row in specs for arm in arms for one in _rows(workspace, row, arm, of_pairs, known, version)]
+    return [
+        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, known, version)
+    ]
 
 
 def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
@@ -201,8 +203,12 @@ def _partners(family: str) -> dict[str, SceneSpec]:
 
     A scenario with a corrected or added scene has none.
     """
-    members = [one for one in corrected_scenarios().values() if one.family == family]
-    specs = {one.scenario_id: one.changed_words() for one in members if one.released and one.params is None}
+    members = [scenario for scenario in corrected_scenarios().values() if scenario.family == family]
+    specs = {
+        scenario.scenario_id: scenario.changed_words()
+        for scenario in members
+        if scenario.released and scenario.params is None
+    }
     return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
 
 

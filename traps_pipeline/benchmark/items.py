@@ -75,9 +75,9 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in BESIDE:
         former = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
-        same = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
+        unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
         rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
-        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in same]
+        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in unchanged]
     scenes = {spec["scenario_id"]: spec["scene_hash"] for spec in specs}
     clips: dict[tuple[str, str], Record] = {
         (row["scenario_id"], row["side"]): row

@@ -158,7 +158,9 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
 
 def seconds_left(workspace: Workspace, category: str) -> float:
     """Estimate one core's time to build a category's table."""
-    return SECONDS_A_RECORD * sum(one.category == category for one in load_scenarios(workspace.study).values())
+    return SECONDS_A_RECORD * sum(
+        scenario.category == category for scenario in load_scenarios(workspace.study).values()
+    )
 
 
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
