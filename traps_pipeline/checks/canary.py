@@ -137,12 +137,12 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
         by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
     changed = list[dict[str, Any]]()
     for model, epochs in by_epoch.items():
-        for then, now in pairwise(epochs):
-            both = [(epochs[then][item], row) for item, row in epochs[now].items() if item in epochs[then]]
+        for earlier, later in pairwise(epochs):
+            both = [(epochs[earlier][item], row) for item, row in epochs[later].items() if item in epochs[earlier]]
             served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
             tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _counted(old, new)]
             changed.append(
-                {"model": model, "from": then, "to": now, "served": " -> ".join(served), "n": len(both)}
+                {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
                 | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )

@@ -44,7 +44,7 @@ class Finding:
 
 def examine(place: Place) -> Iterator[Finding]:
     """Yield one finding for each requirement of the demo."""
-    for what, look in (
+    for topic, look in (
         ("python", lambda: sys.version.split()[0]),
         ("checkout", _checkout),
         ("rendering", draw_frame),
@@ -55,7 +55,7 @@ def examine(place: Place) -> Iterator[Finding]:
         ("keys", _keys),
         ("network", check_network),
     ):
-        yield _finding(what, look)
+        yield _finding(topic, look)
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
@@ -123,7 +123,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
         workspace.bring_folder(workspace.root / folder)
     if workspace.is_shared:
         yield Finding(not missing, "store", "; ".join(missing[:SHOWN]) or "every object is what was written")
-    for what, files, damage_of in (
+    for topic, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
         ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
@@ -132,7 +132,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
     ):
         damaged = [message for path in files if (message := damage_of(path))]
         summary = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
-        yield Finding(not damaged, what, summary or f"{len(files)} files are what was written")
+        yield Finding(not damaged, topic, summary or f"{len(files)} files are what was written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not message, "ledger", "; ".join(message[:SHOWN]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
@@ -153,13 +153,13 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             "store with --workspace s3://BUCKET/STUDY"
         )
     unused = workspace.store.unused(is_removed=is_removed)
-    what = f"{len(unused)} objects ({sum(one.size for one in unused) / 1e6:.1f} MB)"
+    volume = f"{len(unused)} objects ({sum(item.size for item in unused) / 1e6:.1f} MB)"
     if unused:
-        what += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(one.name for one in unused[:SHOWN])}"
-        what += ", .." * (len(unused) > SHOWN)
-    done = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
+        volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:SHOWN])}"
+        volume += ", .." * (len(unused) > SHOWN)
+    effect = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
-        True, "unused", f"{done}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {what}"
+        True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"
     )
 
 
@@ -256,5 +256,7 @@ def _keys() -> str:
     entries = [*load_models().values(), *load_judges().values()]
     for key in sorted({account.key for account in load_accounts().values() if account.key}):
         optional_key(key)  # raises if its value is no key
-    missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
+    missing = [
+        f"{name} not set ({', '.join(entry_ids)} cannot be asked)" for name, entry_ids in missing_keys(entries).items()
+    ]
     return "; ".join(missing) or "all set"

@@ -102,7 +102,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
             for k, (text, abstained, _) in enumerate(_JUDGED)
             if task == "abstention" or not abstained
         }
-        return {name: replace(one, about={**one.about, "check": name, "at": now}) for name, one in requests.items()}
+        return {name: replace(call, about={**call.about, "check": name, "at": now}) for name, call in requests.items()}
     assert isinstance(entry, ModelEntry)
     sent = _studio().prepare(entry.media) if entry.media else None
     forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
@@ -152,7 +152,7 @@ def reach(entry: Entry, account: Account) -> ServerCheck:
     if answer.status_code == BAD_REQUEST and account.key:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
         return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
-    known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
+    known = [str(model["id"]) for model in _listed(answer) if isinstance(model, dict) and "id" in model]
     if known and model_name(entry) not in known:
         unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
         return ServerCheck(unlisted=unlisted)
@@ -167,10 +167,10 @@ def nobody_at(address: str, why: str = "the cause stands above") -> str:
 
 
 def _wrong_key(account: Account) -> str:
-    at = f" at {account.base_url}" if account.base_url else ""
+    where = f" at {account.base_url}" if account.base_url else ""
     if account.key:
-        return f"the key in {account.key} is not accepted{at}: export the right one"
-    return f"a key is wanted{at}: name its variable as `key`"
+        return f"the key in {account.key} is not accepted{where}: export the right one"
+    return f"a key is wanted{where}: name its variable as `key`"
 
 
 def _listed(answer: Any) -> list[Any]:
@@ -201,7 +201,7 @@ def findings(
             continue  # a failure without a schema, too, says nothing about schemas
         if outcome.kind == "error":
             sentence = _failure(entry, account, name, str(outcome.error))
-            if outcome.error == RATE_LIMITED and any(one.kind in WITH_TEXT for one in outcomes.values()):
+            if outcome.error == RATE_LIMITED and any(response.kind in WITH_TEXT for response in outcomes.values()):
                 notes.append(f"{name}: refused as one call too many; a run waits and asks again")
             else:
                 (notes if outcome.error == "timeout" else problems).append(sentence)
@@ -392,7 +392,7 @@ def _outcome(row: Row) -> Outcome:
 
 def require_sound(results: Sequence[LiveResult]) -> None:
     """Raise TrapsError that names every problem of every entry."""
-    wrong = [f"{one.entry.id}: {problem}" for one in results for problem in one.problems]
+    wrong = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
     if wrong:
         more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
         raise TrapsError("\n".join([*wrong, more]))

@@ -129,16 +129,16 @@ def _camel(value: Any) -> Any:
     Gemini accepts snake_case too, and litellm mixes both.
     """
     if isinstance(value, list):
-        return [_camel(one) for one in value]
+        return [_camel(element) for element in value]
     if not isinstance(value, dict):
         return value
-    renamed = {_camel_name(name): one for name, one in value.items()}
-    return {name: one if name == "responseJsonSchema" else _camel(one) for name, one in renamed.items()}
+    renamed = {_camel_name(name): element for name, element in value.items()}
+    return {name: element if name == "responseJsonSchema" else _camel(element) for name, element in renamed.items()}
 
 
 def _camel_name(name: str) -> str:
-    head, *others = name.split("_")
-    return head + "".join(word.capitalize() for word in others)
+    head, *tail = name.split("_")
+    return head + "".join(word.capitalize() for word in tail)
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
@@ -146,8 +146,8 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
     if not isinstance(value, dict) or not value or name in SCHEMAS:
         return {name: value}
     leaves: dict[str, Any] = {}
-    for key, one in value.items():
-        leaves |= flat(one, f"{name}.{key}" if name else key)
+    for key, element in value.items():
+        leaves |= flat(element, f"{name}.{key}" if name else key)
     return leaves
 
 
