@@ -129,8 +129,8 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     print("tokens: millions read, written; minutes of all: models, then judges")
     in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if in_batches < total[1]:
-        how = "expected if all calls are made in batches (traps study export-requests --batch)"
-        print(wrapped(f"{how}: USD {in_batches:,.2f}"))
+        heading = "expected if all calls are made in batches (traps study export-requests --batch)"
+        print(wrapped(f"{heading}: USD {in_batches:,.2f}"))
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(wrapped(f"price unknown, not in the sum: {unknown}"))

@@ -218,9 +218,9 @@ class LiveProgress(PrintedProgress):
         At most 80 columns for names of up to 20.
         """
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
-        left = "" if now.left_s is None else f", {clock(now.left_s)} left"
+        remaining = "" if now.left_s is None else f", {clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
-        return f"{now.name}{counts}  {clock(now.seconds)}{left}{money}"
+        return f"{now.name}{counts}  {clock(now.seconds)}{remaining}{money}"
 
     def _calls(self, now: StageProgress) -> Table:
         from rich.table import Table
@@ -232,13 +232,13 @@ class LiveProgress(PrintedProgress):
             table.add_column(heading, justify="right", no_wrap=True)
         rows = sorted(now.calls.items(), key=lambda pair: pair[1].done >= pair[1].wanted)
         most = max(1, min(MOST_ROWS, self._console.height - 6))
-        for who, traffic in rows[:most]:
-            name = Text(plain(who), no_wrap=True)
+        for participant, traffic in rows[:most]:
+            name = Text(plain(participant), no_wrap=True)
             name.truncate(max(10, self._console.width - _OF_CALLS), overflow="ellipsis")
-            done, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
+            calls, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
             latencies = [f"{traffic.latency_s(share):.1f} s" for share in (0.5, 0.95)]
             table.add_row(
-                name, done, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
+                name, calls, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
             )
         if len(rows) > most:
             table.add_row(f"and {len(rows) - most} more")

@@ -95,8 +95,8 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     from traps_pipeline.storage.workspace import Workspace
 
     studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
-    then, now = (current_rows(study, VERDICTS) for study in studies)
-    table = version_contrasts(then, now)
+    earlier, later = (current_rows(study, VERDICTS) for study in studies)
+    table = version_contrasts(earlier, later)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))
     if arguments.json:
