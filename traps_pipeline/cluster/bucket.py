@@ -125,7 +125,7 @@ class Bucket:
 
         with self._used():
             for page in obstore.list(self._store, below or None):
-                yield from ((one["path"], one["size"], one["last_modified"]) for one in page)
+                yield from ((entry["path"], entry["size"], entry["last_modified"]) for entry in page)
 
     def error(self, error: Exception) -> TrapsError:
         """Return the sentence for people about a store that cannot be used."""

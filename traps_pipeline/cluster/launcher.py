@@ -96,7 +96,7 @@ def tags_of_page_run(run: dg.DagsterRun) -> dict[str, str]:
 
     workspace, declared = Workspace.open(), the_graph().declared
     names = [key.path[-1] for key in run.asset_selection or ()]
-    stages = [one for name in names if isinstance(one := declared.get(name), Stage)]
-    keys = keys_in([one for one in stages if one.name == RESPONSES.name], range_of(run.tags))
+    stages = [declaration for name in names if isinstance(declaration := declared.get(name), Stage)]
+    keys = keys_in([declaration for declaration in stages if declaration.name == RESPONSES.name], range_of(run.tags))
     cpus, gpus = int(os.environ.get(RUN_CPUS, "1")), float(os.environ.get(RUN_GPUS, "0"))
     return own_tags(workspace, stages, keys, cpus, gpus)

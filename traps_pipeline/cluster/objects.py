@@ -75,9 +75,9 @@ class ObjectStore(Store):
 
         Their dependents are then rebuilt.
         """
-        gone = {*lost}
-        self._stored = {seen for seen in self._stored if seen[0] not in gone}
-        named = self.names.naming(gone)
+        lost_digests = {*lost}
+        self._stored = {seen for seen in self._stored if seen[0] not in lost_digests}
+        named = self.names.naming(lost_digests)
         self._change({self.root / name: None for name in named}, self.names.removals)
 
     # --- contents ---------------------------------------------------------------------------------------------------
@@ -249,8 +249,8 @@ class ObjectStore(Store):
         """See `Store`."""
         before = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
         objects = {
-            bytes.fromhex(match[2]): UnusedObject(name, size, at)
-            for name, size, at in self.bucket.names()
+            bytes.fromhex(match[2]): UnusedObject(name, size, modified)
+            for name, size, modified in self.bucket.names()
             if (match := _OBJECT.fullmatch(name))
         }
         named = {*self.names.naming().values()}
@@ -260,7 +260,7 @@ class ObjectStore(Store):
                 f"study {self._study}; see that its variable has the address of the study's own database: nothing was "
                 "removed"
             )
-        unnamed = (digest for digest, one in objects.items() if digest not in named and one.at < before)
+        unnamed = (digest for digest, stored in objects.items() if digest not in named and stored.at < before)
         old = sorted(unnamed, key=lambda digest: objects[digest].at)
         if is_removed:
             batches = [old[first : first + BATCH] for first in range(0, len(old), BATCH)]
@@ -281,6 +281,6 @@ def _side_by_side(work: Callable[[T], R], of: Iterable[T]) -> list[R]:
     """Return the results of `work` for each element, computed concurrently."""
     each = list(of)
     if len(each) < 2:
-        return [work(one) for one in each]
+        return [work(item) for item in each]
     with ThreadPoolExecutor(min(AT_ONCE, len(each))) as pool:
         return list(pool.map(work, each))

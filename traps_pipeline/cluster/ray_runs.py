@@ -128,7 +128,9 @@ class RayRuns(Runs):
         shared = [stage.shared for stage in stages if stage.shared is not None]
         if not shared:
             return cut(scheme, keys, self._most)
-        seconds = {key: sum(one.seconds(self._workspace, key) for one in shared) / self._cpus for key in keys}
+        seconds = {
+            key: sum(costly_stage.seconds(self._workspace, key) for costly_stage in shared) / self._cpus for key in keys
+        }
         return shared_out(scheme, keys, seconds, self._most)
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
@@ -137,7 +139,7 @@ class RayRuns(Runs):
             progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
             names = [stage.name for stage in stages]
             requests = [
-                (names, {**tags, **self._own_tags(stages, one), **range_tags(one, always=True)}) for one in ranges
+                (names, {**tags, **self._own_tags(stages, keys), **range_tags(keys, always=True)}) for keys in ranges
             ]
             self._requests = {self._submit(*request): request for request in requests}
             yield from self._watch([*self._requests], [])

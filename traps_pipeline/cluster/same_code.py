@@ -60,9 +60,11 @@ def require_same_code(submitted: str, study: str) -> None:
     """
     if not submitted:
         return
-    here, theirs = json.loads(code_here()), json.loads(submitted)
-    if differences := [name for name in sorted(here.keys() & theirs.keys()) if here[name] != theirs[name]]:
-        described = ", ".join(f"{name} {here[name]} here and {theirs[name]} there" for name in differences)
+    own_code, submitted_code = json.loads(code_here()), json.loads(submitted)
+    if differences := [
+        name for name in sorted(own_code.keys() & submitted_code.keys()) if own_code[name] != submitted_code[name]
+    ]:
+        described = ", ".join(f"{name} {own_code[name]} here and {submitted_code[name]} there" for name in differences)
         raise TrapsError(
             f"the host {socket.gethostname()} has other code than the host that submitted this run of the study "
             f"{study}: {described}. Install the same version of the package from the same lock on both, and run the "
