@@ -244,7 +244,9 @@ def import_answers(
 
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
     """Return a message about texts that look like errors, with number and examples."""
-    examples = [f"{requested[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
+    examples = [f"{requested[key].about['item_id']}: {plain(answer.text)[:60]!r}" for key, answer in answers.items()][
+        :SHOWN
+    ]
     return (
         f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
         "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
@@ -317,8 +319,8 @@ def _import_batch(
         for request, outcome in outcomes_of(entries, requested, returned)
     ]
     new = asyncio.run(_store(workspace, ledger, stored))
-    failed = sum(one.outcome.kind in ("error", "malformed") for one in stored)
-    return ImportResult(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
+    failed = sum(answer.outcome.kind in ("error", "malformed") for answer in stored)
+    return ImportResult(new, len(stored) - new - failed, failures([answer.outcome for answer in stored]))
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
@@ -356,26 +358,28 @@ def _by_item(
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
-        (str(at["item_id"]), str(at["regime"]), int(at["run"])): key
+        (str(about["item_id"]), str(about["regime"]), int(about["run"])): key
         for key, request in requested.items()
-        if (at := request.about)["model"] == model
+        if (about := request.about)["model"] == model
     }
     names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
     answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
-    for one in imported:
-        run = context.run + one.epoch - 1 if one.run is None else one.run
-        key = keys.get((names.get(one.item, one.item), one.regime, run))
+    for logged in imported:
+        run = context.run + logged.epoch - 1 if logged.run is None else logged.run
+        key = keys.get((names.get(logged.item, logged.item), logged.regime, run))
         try:
             if key is None:
-                wrong.append(f"{one.where}: {one.item} under {one.regime}, run {run}, is not wanted of {model}")
-            elif one.has_failed:
+                wrong.append(
+                    f"{logged.where}: {logged.item} under {logged.regime}, run {run}, is not wanted of {model}"
+                )
+            elif logged.has_failed:
                 failed.add(key)
-            elif answers.setdefault(key, answer := Answer(key=key, **one.answer)) != answer:
-                wrong.append(f"{one.where}: gives another answer to {one.item} than an earlier one")
+            elif answers.setdefault(key, answer := Answer(key=key, **logged.answer)) != answer:
+                wrong.append(f"{logged.where}: gives another answer to {logged.item} than an earlier one")
         except ValidationError as error:
-            wrong.append(f"{one.where}: {explain(error)}")
+            wrong.append(f"{logged.where}: {explain(error)}")
         except TypeError as error:
-            wrong.append(f"{one.where}: {plain(error)[:200]}")
+            wrong.append(f"{logged.where}: {plain(error)[:200]}")
     if wrong:
         more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise TrapsError("\n".join(map(plain, wrong[:SHOWN])) + more + "\nnothing was imported")
@@ -388,7 +392,7 @@ async def _store(workspace: Workspace, ledger: Ledger, stored: Sequence[_Stored]
     A failed call is stored, too, and is asked again.
     """
     rows: dict[str, list[Stored]] = {}
-    for one in sorted(stored, key=lambda one: one.evaluation):
-        row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
-        rows.setdefault(one.evaluation.key, []).append(row)
+    for answer in sorted(stored, key=lambda answer: answer.evaluation):
+        row = ledger_row(answer.request, answer.outcome, 1, answer.latency_s, workspace.study.epoch)
+        rows.setdefault(answer.evaluation.key, []).append(row)
     return await ledger.store(rows, progress.current().note)
