@@ -26,9 +26,9 @@ def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.Da
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         rows.append(about | _panel_row(group.values))
-        for one, other in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
-            name = f"{group.judges[one]}+{group.judges[other]}"
-            rows.append(about | {"judges": name} | _pair_row(group.values[:, [one, other]]))
+        for left, right in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
+            name = f"{group.judges[left]}+{group.judges[right]}"
+            rows.append(about | {"judges": name} | _pair_row(group.values[:, [left, right]]))
     return pd.DataFrame(rows, columns=pd.Index(AGREEMENT.names))
 
 
@@ -56,7 +56,9 @@ def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings
             chosen = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
             group = ratings_of_study.select(chosen.to_numpy(bool))
             if len(group.values):
-                versions = {name: _joined(group.answers[name].unique(), by) for name, by in _JOINS.items()}
+                versions = {
+                    name: _joined(group.answers[name].unique(), separator) for name, separator in _JOINS.items()
+                }
                 yield {"dataset": dataset, "task": task, **versions}, group
 
 

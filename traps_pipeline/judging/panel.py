@@ -267,16 +267,16 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     )
     panel, row_of = load_panel(study.panel), partial(_vote_row, panel_id(study.panel))
     parts = {cell: _parts(workspace, cell) for cell in cells}
-    done: dict[Cell, list[StageOutput]] = {}
+    outputs: dict[Cell, list[StageOutput]] = {}
 
     def calls(part: AnswerSlice) -> list[Ballot]:
         return wanted_ballots(workspace, panel, part.whole, part.start, PART)
 
-    every = [part for of in parts.values() for part in of]
+    every = [part for slice_parts in parts.values() for part in slice_parts]
     for part, output in ask_judges(workspace, "votes", panel, every, calls, lambda settled: settled.output(row_of)):
-        done.setdefault(part.whole, []).append(output)
-        if len(done[part.whole]) == len(parts[part.whole]):
-            yield part.whole, joined(done.pop(part.whole))
+        outputs.setdefault(part.whole, []).append(output)
+        if len(outputs[part.whole]) == len(parts[part.whole]):
+            yield part.whole, joined(outputs.pop(part.whole))
 
 
 def _parts(workspace: Workspace, cell: Cell) -> list[AnswerSlice]:
