@@ -109,8 +109,8 @@ class Batch:
         if self.reservations:
             self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
         if self.covered:
-            gone = [{"gone": reservation} for reservation in self.covered]
-            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), gone)
+            removed = [{"gone": reservation} for reservation in self.covered]
+            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), removed)
         for (kind, participant), its in self.totals.items():
             self._add_totals(kind, participant, its)
         for participant, usd in self.more_usd.items():

@@ -175,8 +175,8 @@ class PostgresDatabase(Database):
             SESSIONS.name
         ):
             return False
-        others = sa.select(SESSIONS.c.id).where(SESSIONS.c.id != self.session).limit(1)
-        return connection.execute(others).scalar() is not None
+        other_sessions = sa.select(SESSIONS.c.id).where(SESSIONS.c.id != self.session).limit(1)
+        return connection.execute(other_sessions).scalar() is not None
 
     def _require(self, number: int) -> None:
         if not self._is_fresh():
@@ -290,10 +290,10 @@ class PostgresDatabase(Database):
     def _compare_clocks(self, connection: sa.Connection) -> None:
         """Raise TrapsError if this host's clock and the database's are too far apart."""
         before = time.time()
-        theirs = self.now_s(connection)
-        apart = max(theirs - time.time(), before - theirs)
+        server_s = self.now_s(connection)
+        apart = max(server_s - time.time(), before - server_s)
         if apart > SKEW_S:
-            behind = "behind" if theirs > before else "ahead of"
+            behind = "behind" if server_s > before else "ahead of"
             raise TrapsError(
                 f"the clock of the host {socket.gethostname()} is {apart:.0f} s {behind} that of the database at "
                 f"{self.place}, and hosts of the study {self.study_name} may be {SKEW_S} s apart; set the clocks of "

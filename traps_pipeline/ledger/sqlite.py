@@ -56,8 +56,8 @@ class SqliteDatabase(Database):
         # A folder that cannot be written holds a file that nobody changes, and SQLite could not make its log there.
         is_fixed = self.path.exists() and not os.access(self.folder, os.W_OK)
         # A log left by a killed process holds committed rows, which `immutable` would not read.
-        how = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
-        uri = f"file:{quote(str(self.path))}" + (f"?{how}" if is_fixed else "")
+        mode = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
+        uri = f"file:{quote(str(self.path))}" + (f"?{mode}" if is_fixed else "")
         connection = sqlite3.connect(uri, uri=True, timeout=WAIT_S, isolation_level=None, check_same_thread=False)
         if not is_fixed:
             connection.execute("pragma journal_mode=wal")
