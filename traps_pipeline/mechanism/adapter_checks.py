@@ -191,13 +191,13 @@ def _patching(subject: Subject) -> str:
     except TrapsError as why:
         return f"refused: {str(why).partition(': ')[2].partition(' (')[0]}"
     tokens = abstention_tokens(model)
-    other = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
-    target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other))
+    other_prompt = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
+    target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
     all_tokens = np.ones(target.length, bool)
     everywhere = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
-    same = patched_changes(model, target, target, [*everywhere, *sites], tokens)
-    _require(bool((same == 0).all()), "a patch with itself changes the outcome")
+    self_patched = patched_changes(model, target, target, [*everywhere, *sites], tokens)
+    _require(bool((self_patched == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
     far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
     _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
@@ -206,7 +206,7 @@ def _patching(subject: Subject) -> str:
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(what for what, differs in beside.items() if differs)
+    also = ", ".join(name for name, differs in beside.items() if differs)
     return "exactly 0, and 1" + (f" with {also}" if also else "")
 
 

@@ -210,18 +210,18 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     """
     items, width = run.items, int(run.items["width"].iloc[0])
     prompts, place = np.unique(items["states_key"].to_numpy(str), return_inverse=True)
-    of = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
+    places = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
     groups: dict[tuple[str, ...], list[Row]] = {}
     for draw in range(draws):
         vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
-        for row in score_features(run, {name: vectors[rows] for name, rows in of.items()}):
+        for row in score_features(run, {name: vectors[rows] for name, rows in places.items()}):
             groups.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
     rows = []
-    for same in groups.values():
-        values = np.array([row["value"] for row in same], float)
+    for group in groups.values():
+        values = np.array([row["value"] for row in group], float)
         if np.isnan(values).any():  # no features of these items allow this figure
             continue
-        rows.append(same[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
+        rows.append(group[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
     return rows
 
 

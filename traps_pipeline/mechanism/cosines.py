@@ -48,9 +48,11 @@ def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> 
     """
     products = one.values @ other.values.T
     differ = (one.scenario[:, None] != other.scenario).astype(float)
-    left, right = weights[:, one.scenario], weights[:, other.scenario]
+    left_weights, right_weights = weights[:, one.scenario], weights[:, other.scenario]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return ((left @ (products * differ)) * right).sum(axis=1) / ((left @ differ) * right).sum(axis=1)
+        return ((left_weights @ (products * differ)) * right_weights).sum(axis=1) / (
+            (left_weights @ differ) * right_weights
+        ).sum(axis=1)
 
 
 def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
@@ -88,7 +90,7 @@ def cosine_rows(workspace: Workspace) -> list[CosineRow]:
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []
     for model in sorted({extraction.model for extraction in extractions}):
-        rows += _of_model(workspace, [one for one in extractions if one.model == model])
+        rows += _of_model(workspace, [candidate for candidate in extractions if candidate.model == model])
     if not rows:
         raise TrapsError("cosines: no directions yet; materialize directions first")
     return rows
@@ -110,8 +112,8 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
         cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in named]))
         differences = []
         for (states, dataset, _), (_, voids, controls), place in zip(named, pairs, places, strict=True):
-            at = np.asarray(states.read(dataset, layer), float)
-            differences.append(PairDifferences(at[voids] - at[controls], place))
+            layer_states = np.asarray(states.read(dataset, layer), float)
+            differences.append(PairDifferences(layer_states[voids] - layer_states[controls], place))
         halves = [split_half(of, [workspace.mechanism.seed, layer]) for of in differences]
         for i, (own, dataset, _) in enumerate(named):
             for j, (other, other_dataset, _) in enumerate(named):
@@ -146,8 +148,8 @@ def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
 
     The first are 1, the others resampled within its taxonomy.
     """
-    weights, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
+    weights, taxonomy_of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
-        if n := int(np.count_nonzero(of == taxonomy)):
-            weights[1:, of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
+        if n := int(np.count_nonzero(taxonomy_of == taxonomy)):
+            weights[1:, taxonomy_of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
     return weights

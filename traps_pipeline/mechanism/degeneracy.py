@@ -25,18 +25,18 @@ def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | N
         return "empty"
     if repeats(text):
         return "repetition"
-    own, other = script(unsteered or ""), script(text)
-    return "script" if own and other and own != other else None
+    unsteered_script, steered_script = script(unsteered or ""), script(text)
+    return "script" if unsteered_script and steered_script and unsteered_script != steered_script else None
 
 
 def repeats(text: str) -> bool:
     """Return whether a phrase of at most LONGEST words stands REPEATED times in a row."""
     words = text.lower().split()
     for size in range(1, LONGEST + 1):
-        same = 0
+        repeated = 0
         for place in range(size, len(words)):
-            same = same + 1 if words[place] == words[place - size] else 0
-            if same >= size * (REPEATED - 1):
+            repeated = repeated + 1 if words[place] == words[place - size] else 0
+            if repeated >= size * (REPEATED - 1):
                 return True
     return False
 

@@ -136,7 +136,7 @@ def extract_directions(
         if kind in nulls:
             null_vectors = _null_draws(kind, void, control, np.random.default_rng([*seed, number]), draws)
             vectors[kind] = _orthogonal(null_vectors, unit)
-    directions = {kind: of.astype(np.float32) for kind, of in vectors.items()}
+    directions = {kind: vector.astype(np.float32) for kind, vector in vectors.items()}
     return Directions(directions, gaps, np.linalg.norm(control, axis=2).mean(axis=1))
 
 
@@ -161,7 +161,7 @@ def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """
     remainder = vectors - (vectors * unit).sum(axis=2, keepdims=True) * unit
     remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
-    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (vectors, remainder))
+    before, after = (np.linalg.norm(vector, axis=2, keepdims=True) for vector in (vectors, remainder))
     differs = np.abs(unit).max(axis=1) > 0
     mask = (after > _NOTHING_LEFT * before) & differs[None, :, None]
     return np.where(mask, remainder / np.where(mask, after, 1), 0.0)

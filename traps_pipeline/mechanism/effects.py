@@ -89,7 +89,9 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
             about = dict(zip(keys, cast("tuple[str, ...]", key), strict=True))
             top = part["alpha"].max()
             ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
-            figures = {f"{side}_{end}": at[side].mean() for side in ("control", "void") for end, at in ends.items()}
+            figures = {
+                f"{side}_{end}": means[side].mean() for side in ("control", "void") for end, means in ends.items()
+            }
             result.append({**about, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **figures})
     return pd.DataFrame(result, columns=pd.Index(REGIME_COLUMNS))
 
@@ -108,8 +110,8 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
     well_posed = [name for name in DATASETS if not is_ill_posed(name)]
     rows = rows.loc[(rows["kind"] == "void") & rows["target"].isin(well_posed)]
     rows = rows.loc[rows["alpha"] == rows.groupby(CELL)["alpha"].transform("max")]
-    same = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
-    wide = rows.assign(domain=same.map({True: "same", False: "cross"})).pivot_table(
+    is_within = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
+    wide = rows.assign(domain=is_within.map({True: "same", False: "cross"})).pivot_table(
         index=[*CELL, "source", "alpha"], columns="domain", values="control"
     )
     columns = pd.Index([*CELL, "source", "alpha", "same", "cross"])
@@ -161,7 +163,7 @@ def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
-    by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
+    columns = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
     kinds = {kind: place for place, kind in enumerate(KINDS)}
 
     def place(values: Any) -> Any:
@@ -169,4 +171,4 @@ def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
             return values.map(order)
         return values.map(kinds) if values.name == "kind" else values
 
-    return rows.sort_values(by, key=place, ignore_index=True, kind="stable")
+    return rows.sort_values(columns, key=place, ignore_index=True, kind="stable")

@@ -119,7 +119,7 @@ def _each(
         progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
         decisions = _decisions(workspace, table, gates, layers)
         for regime, source in product(outcomes, gates.sources):
-            own = {target: one for (of, target), one in decisions.items() if of == source}
+            own = {target: decision for (name, target), decision in decisions.items() if name == source}
             yield regime, outcomes[regime], gates.name, source, own
 
 
@@ -202,8 +202,8 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
     If shuffled, a scenario's sides are swapped with probability 0.5.
     """
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
-    for name, of in features.items():
-        values[(table["dataset"] == name).to_numpy()] = of
+    for name, rows in features.items():
+        values[(table["dataset"] == name).to_numpy()] = rows
     if shuffled:
         void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
         table = table.assign(void=void)
@@ -270,7 +270,7 @@ def _rows(
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
         if len(of_datasets) == len(DATASETS):
-            means = {name: float(np.mean([one[name] for one in of_datasets])) for name in of_datasets[0]}
+            means = {name: float(np.mean([scores[name] for scores in of_datasets])) for name in of_datasets[0]}
             sides = [
                 sum(getattr(r, name) for r in rows[-len(decided) :] if r.target in DATASETS)
                 for name in ("n_controls", "n_voids")

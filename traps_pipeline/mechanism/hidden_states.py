@@ -98,10 +98,10 @@ def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) 
     """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
     if times is None or times == clip:
         return shown.times_s
-    other = sample(times, spec).times_s
-    if len(other) == len(shown.times_s):
-        return other
-    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(other)), other)
+    sampled_s = sample(times, spec).times_s
+    if len(sampled_s) == len(shown.times_s):
+        return sampled_s
+    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(sampled_s)), sampled_s)
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
@@ -202,9 +202,9 @@ def _make(
     """
     shard: list[_Made] = []
     try:
-        for done, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
+        for finished, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
-            tick(done)
+            tick(finished)
     finally:
         with alone(FolderStore(folder), _WRITING):
             _flush(folder, shard, model, pooling, known)

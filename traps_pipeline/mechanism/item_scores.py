@@ -50,8 +50,8 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {
-                f"abstained_{regime}": _decided(of[dataset].abstained[place] if of else np.nan)
-                for regime, of in outcomes.items()
+                f"abstained_{regime}": _decided(outcome[dataset].abstained[place] if outcome else np.nan)
+                for regime, outcome in outcomes.items()
             }
             rows.append(
                 ItemScoreRow(

@@ -72,8 +72,8 @@ def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
     which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any figure.
     """
     target = LOOKS_LIKE.get(target, target)
-    others = [pair for pair in curves if target not in pair]
-    pairs = [pair for pair in others if pair[0] != pair[1]] or others or [*curves]
+    other_pairs = [pair for pair in curves if target not in pair]
+    pairs = [pair for pair in other_pairs if pair[0] != pair[1]] or other_pairs or [*curves]
     if not pairs:
         raise TrapsError("probes: no dataset has both sides, so no layer can be chosen; extract more hidden states")
     layers = sorted(set.intersection(*({*curves[pair]} for pair in pairs)))

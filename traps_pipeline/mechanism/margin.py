@@ -58,13 +58,13 @@ def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) 
     """
     import torch
 
-    chosen = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
-    chosen[list(tokens)] = True
-    others = ~chosen
+    is_abstention = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
+    is_abstention[list(tokens)] = True
+    alternatives = ~is_abstention
     if never:
-        others[list(never)] = False
+        alternatives[list(never)] = False
     logits = logits.float()
-    return torch.logsumexp(logits[..., chosen], -1) - torch.logsumexp(logits[..., others], -1)
+    return torch.logsumexp(logits[..., is_abstention], -1) - torch.logsumexp(logits[..., alternatives], -1)
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:

@@ -60,8 +60,10 @@ def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
     """
     states = np.asarray(states, float)
     centred, label = states - states.mean(axis=0), void - np.mean(void)
-    left, size, right = np.linalg.svd(centred, full_matrices=False)
+    left_vectors, size, right_vectors = np.linalg.svd(centred, full_matrices=False)
     mask = size > size[0] * max(states.shape) * np.finfo(float).eps
-    towards = left[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
+    towards = left_vectors[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
     towards /= np.linalg.norm(towards)
-    return states - np.outer(centred @ ((towards / size[mask]) @ right[mask]), (towards * size[mask]) @ right[mask])
+    return states - np.outer(
+        centred @ ((towards / size[mask]) @ right_vectors[mask]), (towards * size[mask]) @ right_vectors[mask]
+    )

@@ -266,7 +266,7 @@ def _behind(weights: Weights, layer: int) -> Tensor | None:
 
     They affect all later layers.
     """
-    parts = [part for (site, at), part in weights.items() if site == "residual" and at <= layer]
+    parts = [part for (site, patch_layer), part in weights.items() if site == "residual" and patch_layer <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
@@ -298,12 +298,12 @@ def _margins(
     inputs = _repeated(target, rows)
     if ("residual", 0) in weights:
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
-    for number, theirs in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
+    for number, source_embeds in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
         # Features number k are added to what block k + 1 puts out: behind the sites up to there.
         behind, features = _behind(weights, number + 1), inputs["deepstack_visual_embeds"]
         if behind is not None and target.visual is not None:
             own = features[number].unflatten(0, (rows, -1))
-            features[number] = _mixed(own, theirs, behind[:, target.visual]).flatten(0, 1)
+            features[number] = _mixed(own, source_embeds, behind[:, target.visual]).flatten(0, 1)
     with _replacing(model, target, source, weights, start, rows):
         last = model.network.get_decoder()(**inputs).last_hidden_state[:, -1]
     return first_token_margins(model, last, tokens)

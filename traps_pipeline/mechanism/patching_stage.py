@@ -174,16 +174,16 @@ class Pairs:
             cells: list[tuple[Site, int, str]]
             cells = [(site, layer, group) for side, site, layer, group in best if side == into and groups[group].any()]
             patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
-            plain, there = record(self._model, target.prompt, self._tokens, ()), 0.0
+            plain, source_margin = record(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
                 side = self._source(name, into, kind)
                 if side is None:
                     yield {"scenario": name, "into": into, "source": kind, "left_out": True}
                     continue
                 margin, changes = self._patched(plain, side, patches)
-                there = margin if kind == OWN else there
+                source_margin = margin if kind == OWN else source_margin
                 for cell, patch, change in zip(cells, patches, changes, strict=True):
-                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, there), float(change))
+                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, source_margin), float(change))
             del plain  # before the other side's pass is recorded
 
     def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
@@ -224,8 +224,8 @@ class Pairs:
             candidates = [where[kind]]
         else:
             first = self._names.index(name)
-            others = [*self._names[first + 1 :], *self._names[:first]]
-            candidates = [(other, towards if kind == OTHER else into, "") for other in others]
+            other_names = [*self._names[first + 1 :], *self._names[:first]]
+            candidates = [(other, towards if kind == OTHER else into, "") for other in other_names]
         form = self._form(name, into)
         for candidate in candidates:
             if candidate[:2] in self._items and _fits(form, self._form(*candidate)):
@@ -240,9 +240,9 @@ class Pairs:
     def _make_side(self, name: str, which: str, times_of: str = "") -> Side:
         row = self._items[name, which]
         clip, question = self._workspace.resolve(row["clip"]), str(row["question"])
-        other = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
+        other_clip = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
         frames = sample(clip, self._spec)
-        times = shown_times(frames, clip, self._spec, other)
+        times = shown_times(frames, clip, self._spec, other_clip)
         prompt = self._model.prompt(self._system, question, frames.frames, times)
         side = Side(prompt, spans(self._model, prompt, self._system, question))
         self._parts[name, which, times_of] = side.parts

@@ -62,8 +62,8 @@ def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]
     sides = clips.loc[clips["scenario_id"] == row["scenario_id"]].set_index("side")
     if not {"control", "void"} <= set(sides.index):
         raise TrapsError(f"{row['scenario_id']}: lacks a clip of its pair; materialize videos for {row['category']}")
-    which = "void" if sides.loc["control", "file_sha256"] == row["media_digest"] else "control"
-    return workspace.resolve(str(sides.loc[which, "path"])), str(sides.loc[which, "file_sha256"])
+    side = "void" if sides.loc["control", "file_sha256"] == row["media_digest"] else "control"
+    return workspace.resolve(str(sides.loc[side, "path"])), str(sides.loc[side, "file_sha256"])
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
@@ -99,15 +99,15 @@ def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
         sides = {str(row["side"]): row for row in pair.to_dict("records")}
         if len(sides) < 2:
             continue
-        for side, other in (("control", "void"), ("void", "control")):
+        for side, other_side in (("control", "void"), ("void", "control")):
             row, name = sides[side], f"{TIME_SWAPPED}:{sides[side]['scenario_id']}"
             rows.append(
                 ProbeItemRow(
                     **{name: row[name] for name in (*COPIED, "benchmark_version")} | {"pair_id": name},
                     item_id=f"{name}:{side}",
                     dataset=TIME_SWAPPED,
-                    times_clip=sides[other]["clip"],
-                    times_digest=sides[other]["media_digest"],
+                    times_clip=sides[other_side]["clip"],
+                    times_digest=sides[other_side]["media_digest"],
                 )
             )
     return rows

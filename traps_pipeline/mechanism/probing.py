@@ -108,9 +108,10 @@ class ProbeRun:
             taxonomy: scenario_weights(len(index), self.settings.resamples, [self.seed, k])
             for k, (taxonomy, index) in enumerate(taxonomies.items())
         }
-        self._labels = {name: (of["side"] == "void").to_numpy() for name, of in self._of.items()}
+        self._labels = {name: (dataset_items["side"] == "void").to_numpy() for name, dataset_items in self._of.items()}
         self._places = {
-            name: self._index[name].get_indexer(pd.Index(of["scenario_id"])) for name, of in self._of.items()
+            name: self._index[name].get_indexer(pd.Index(dataset_items["scenario_id"]))
+            for name, dataset_items in self._of.items()
         }
         self._restricted = {
             name: np.isin(self._of[name]["scenario_id"].to_numpy(str), sorted(self.confabulated.scenarios[name]))
@@ -133,12 +134,12 @@ class ProbeRun:
 
     # --- the parts of the protocol ---
 
-    def rows(self, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Row]:
+    def rows(self, progress: Callable[[int, int], None] = lambda layers_done, total: None) -> list[Row]:
         """Return every row of the probes table without the columns that partition it."""
         rows: list[Row] = []
-        for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+        for layers_done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
             rows += of_layer
-            progress(done, self.n_layers)
+            progress(layers_done, self.n_layers)
         return mark_layers(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
@@ -251,8 +252,8 @@ class ProbeRun:
                 labels = np.repeat([True, False], [len(values) for values, _ in chosen])
                 values = np.concatenate([values for values, _ in chosen])
                 scenario = np.concatenate([places for _, places in chosen])
-                of = Split(values[:, None], labels, scenario)
-                rows.append(self._scored(analysis, (source, extra), layer, of, values))
+                split = Split(values[:, None], labels, scenario)
+                rows.append(self._scored(analysis, (source, extra), layer, split, values))
         return rows
 
     def time_swapped(
@@ -264,8 +265,10 @@ class ProbeRun:
         """
         if TIME_SWAPPED not in splits:
             return []
-        of = splits[TIME_SWAPPED]
-        return [self._scored("time_swapped", (s, TIME_SWAPPED), layer, of, unseen[s][TIME_SWAPPED]) for s in self._own]
+        split = splits[TIME_SWAPPED]
+        return [
+            self._scored("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
+        ]
 
     @staticmethod
     def _side(
@@ -280,11 +283,11 @@ class ProbeRun:
         There is one probe for items of another taxonomy, and one per fold for those of the source's own.
         """
         split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
-        others = [name for name in splits if name not in own]
+        other_datasets = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
-        if others:
+        if other_datasets:
             probe = self.fit(split.states, split.void)
-            scores |= {name: probe.scores(splits[name].states) for name in others}
+            scores |= {name: probe.scores(splits[name].states) for name in other_datasets}
         folds = self._folds({name: splits[name] for name in own})
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)

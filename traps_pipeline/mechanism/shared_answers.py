@@ -147,9 +147,9 @@ def make_meanwhile(
     Return their number. tick: receives the chunks done and their number.
     """
     chunks, count = shared.chunks(wanted), 0
-    for done, chunk in enumerate(reversed(chunks), start=1):
+    for finished, chunk in enumerate(reversed(chunks), start=1):
         count += shared.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
-        tick(done, len(chunks))
+        tick(finished, len(chunks))
         if not is_written(ledger, evaluation):
             break
     return count

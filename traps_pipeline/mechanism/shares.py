@@ -61,9 +61,9 @@ def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
     plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=_ALONG)
-    same = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
-    paths = steered[[*same, *_ALONG]].drop_duplicates()
-    return pd.concat([steered, plain.merge(paths, on=same)], ignore_index=True)
+    keys = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
+    paths = steered[[*keys, *_ALONG]].drop_duplicates()
+    return pd.concat([steered, plain.merge(paths, on=keys)], ignore_index=True)
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:

@@ -128,8 +128,8 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
     from traps_pipeline.models.local.capture import OF_PAIRS
 
     times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
-    other = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
-    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other)
+    other_prompt = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
+    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other_prompt)
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
@@ -272,7 +272,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     chosen, *sides = direction_pairs(settings, dataset, items)
     assert steering is not None, "direction_pairs refuses a study that steers nothing"
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
-    voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
+    voids, controls = (np.stack([layer_states[rows] for layer_states in layers]) for rows in sides)
     seed = [settings.seed, DATASETS.index(dataset)]
     nulls = steering.nulls
     kinds, draws = (nulls.kinds, nulls.draws) if nulls else ((), 1)

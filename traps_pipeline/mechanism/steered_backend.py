@@ -68,9 +68,9 @@ class SteeredBackend(LocalBackend):
             most = requests[0].params["max_new_tokens"]
             with model.caching_clips():
                 generated = model.generate(prompts, most, None, hook, stopped=stopped)
-            for number, one in zip(numbers, generated, strict=True):
-                counts = (one.prompt_tokens, one.completion_tokens)
-                outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)
+            for number, answer in zip(numbers, generated, strict=True):
+                counts = (answer.prompt_tokens, answer.completion_tokens)
+                outcomes[number] = outcome(answer.text, answer.finish_reason, *counts, model.served_model)
         return [outcomes[number] for number in range(len(batch))]
 
     def _model(self) -> Any:

@@ -104,20 +104,20 @@ def strengths(
     if not plan:
         raise TrapsError(f"no direction leads to {target}; materialize hidden_states and directions first")
     for row in plan:
-        of, layer = directions[row.source], row.layer
-        if row.kind not in of.vectors or row.draw >= len(of.vectors[row.kind]):
+        vectors, layer = directions[row.source], row.layer
+        if row.kind not in vectors.vectors or row.draw >= len(vectors.vectors[row.kind]):
             raise TrapsError(
                 f"the directions of {row.source} have no {row.kind} draw {row.draw}; materialize directions again"
             )
-        vector = of.vectors[row.kind][row.draw][_in_range(layer, of)]
+        vector = vectors.vectors[row.kind][row.draw][_in_range(layer, vectors)]
         if not vector.any():
             raise TrapsError(
                 f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
                 "there; name another layer in the experiment and in study.yaml"
             )
-        for unit, dose in _within(row, of, layer, steering.cap):
-            alpha = dose * float(of.gaps[layer]) if unit == "gap" else dose
-            relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
+        for unit, dose in _within(row, vectors, layer, steering.cap):
+            alpha = dose * float(vectors.gaps[layer]) if unit == "gap" else dose
+            relative = float(alpha / vectors.residual_norms[layer]) if vectors.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
             pairs.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
     return pairs
@@ -161,13 +161,13 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
     """
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
-    at = layers.steering
-    plan = [_Planned(source, "void", 0, at, BY_LABEL, SIDES, doses) for source in sources_of(target)]
-    plan += [_Planned(target, "void", 0, at, signs, SIDES, doses) for signs in steering.signs]
+    steered_layer = layers.steering
+    plan = [_Planned(source, "void", 0, steered_layer, BY_LABEL, SIDES, doses) for source in sources_of(target)]
+    plan += [_Planned(target, "void", 0, steered_layer, signs, SIDES, doses) for signs in steering.signs]
     if steering.nulls:
         draws = product(steering.nulls.kinds, range(steering.nulls.draws))
-        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses) for kind, draw in draws]
-    sweep = [layer for layer in layers.sweep if layer != at]
+        plan += [_Planned(target, kind, draw, steered_layer, BY_LABEL, SIDES, doses) for kind, draw in draws]
+    sweep = [layer for layer in layers.sweep if layer != steered_layer]
     plan += [_Planned(target, "void", 0, layer, BY_LABEL, ("control",), alphas) for layer in sweep]
     return [row for row in plan if row.source in sources]
 
@@ -294,9 +294,9 @@ def collect_steered(
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
-        for of in of_prompt.values()
-        for kind in of.vectors
-        for draw in of.vectors[kind]
+        for group in of_prompt.values()
+        for kind in group.vectors
+        for draw in group.vectors[kind]
         for vector in draw
     }
 
