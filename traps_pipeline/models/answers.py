@@ -88,8 +88,8 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         for item in items:
             jobs[item["media_digest"], repr(spec)] = (workspace.root / item["clip"], item["media_digest"], spec)
     with ThreadPoolExecutor(cores()) as pool:
-        for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
-            progress.current().tick("responses", "media to send", done, len(jobs))
+        for finished, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
+            progress.current().tick("responses", "media to send", finished, len(jobs))
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:

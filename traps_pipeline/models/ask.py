@@ -257,7 +257,7 @@ async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models in parallel; a failing model yields its exception."""
-    done: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
+    finished: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
@@ -267,14 +267,14 @@ async def settle(
                     return
                 async for settled in settle_evaluation(work, evaluation, mine, stop):
                     await turn.acquire()
-                    done.put_nowait(settled)
+                    finished.put_nowait(settled)
                     del settled
         except LockGivenUp:
             return
         except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
-            done.put_nowait(error)
+            finished.put_nowait(error)
         finally:
-            done.put_nowait(None)
+            finished.put_nowait(None)
 
     ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
     by_evaluation = [(e, list(mine)) for e, mine in groupby(ordered, key=lambda cell: cell.evaluation)]
@@ -284,7 +284,7 @@ async def settle(
     try:
         open_tasks = len(tasks)
         while open_tasks:
-            settled = await done.get()
+            settled = await finished.get()
             if settled is None:
                 open_tasks -= 1
             else:

@@ -158,7 +158,7 @@ class _Texts:
 
 def _chat(body: Json) -> Reply:
     choices = _objects(body, "choices")
-    choice = next((one for one in choices if one.get("index") == 0), choices[0])
+    choice = next((candidate for candidate in choices if candidate.get("index") == 0), choices[0])
     message, texts = _object(choice, "message"), _Texts()
     texts.add(message.get("content"))
     texts.add(_text_of(message, "refusal"), "refusal")
@@ -211,7 +211,7 @@ _READERS: Mapping[Dialect, Callable[[Json], Reply]] = {
 
 def _objects(body: Json, name: str, least: int = 1) -> list[dict[str, Any]]:
     values = body.get(name)
-    if not isinstance(values, list) or len(values) < least or not all(isinstance(one, dict) for one in values):
+    if not isinstance(values, list) or len(values) < least or not all(isinstance(value, dict) for value in values):
         raise OddShapeError(f"it has no list `{name}`")
     return values
 

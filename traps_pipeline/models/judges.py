@@ -238,7 +238,7 @@ def id_of_judges(name: str, seats: Sequence[Judge]) -> str:
 
 def panel_names(panels: str) -> list[str]:
     """Return the names of the panels in a column of joined panel ids."""
-    return [one.partition("@")[0] for one in panels.split("+") if one]
+    return [panel_id.partition("@")[0] for panel_id in panels.split("+") if panel_id]
 
 
 def is_judged_by_rules(panels: str, model: str) -> bool:

@@ -151,10 +151,10 @@ def degenerate(text: str) -> str | None:
         return "repeats a character"
     if len(words) >= _LEAST_WORDS:
         for unit in range(1, _LONGEST_UNIT + 1):
-            same = 0
-            while same < len(words) - unit and words[-1 - same] == words[-1 - same - unit]:
-                same += 1
-            repeats, share = same // unit + 1, (same + unit) / len(words)
+            repeated = 0
+            while repeated < len(words) - unit and words[-1 - repeated] == words[-1 - repeated - unit]:
+                repeated += 1
+            repeats, share = repeated // unit + 1, (repeated + unit) / len(words)
             if repeats >= _LEAST_REPEATS and share >= _LEAST_SHARE:
                 return "repeats itself"
     return None

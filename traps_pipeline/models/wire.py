@@ -117,8 +117,8 @@ class Wire(httpx.AsyncBaseTransport):
 
     def _session(self) -> aiohttp.ClientSession:
         loop = asyncio.get_running_loop()
-        for other in [each for each in self._sessions if each.is_closed()]:
-            _dispose(self._sessions.pop(other))
+        for session in [each for each in self._sessions if each.is_closed()]:
+            _dispose(self._sessions.pop(session))
         if loop not in self._sessions:
             connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
             cookies = aiohttp.DummyCookieJar()

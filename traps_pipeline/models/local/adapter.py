@@ -78,8 +78,8 @@ def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None
     import torch
 
     needed = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
-    others = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
-    for key in others:
+    loaded_keys = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
+    for key in loaded_keys:
         if needed <= WEIGHTS_SHARE * free_bytes(device):
             return
         del _LOADED[key]

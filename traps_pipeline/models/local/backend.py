@@ -111,10 +111,16 @@ class LocalBackend:
         generated = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [
             replace(
-                outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model),
-                first_token=stored_alternatives(one.first_token, request.about.get("regime")),
+                outcome(
+                    decoded.text,
+                    decoded.finish_reason,
+                    decoded.prompt_tokens,
+                    decoded.completion_tokens,
+                    model.served_model,
+                ),
+                first_token=stored_alternatives(decoded.first_token, request.about.get("regime")),
             )
-            for request, one in zip(batch.requests, generated, strict=True)
+            for request, decoded in zip(batch.requests, generated, strict=True)
         ]
 
 

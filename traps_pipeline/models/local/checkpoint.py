@@ -91,8 +91,8 @@ def declared_digest(params: LocalParams) -> str | None:
 
 def download_command(params: LocalParams) -> str:
     """Return the command that downloads a hub id's weights."""
-    at = f" --revision {params.revision}" if params.revision else ""
-    return f"hf download {params.checkpoint}{at}"
+    revision = f" --revision {params.revision}" if params.revision else ""
+    return f"hf download {params.checkpoint}{revision}"
 
 
 def _cached_snapshot(params: LocalParams) -> Path | None:

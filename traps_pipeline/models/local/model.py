@@ -275,7 +275,7 @@ class LocalModel:
         sampling, steering = sampling and sampling.rows(rows), steering and steering.rows(rows)
         try:
             tokens, first = decode(self, batch, max_new_tokens, sampling, steering, stopped)
-            return [self._answer(*one) for one in zip(batch, tokens, first, strict=True)]
+            return [self._answer(*row) for row in zip(batch, tokens, first, strict=True)]
         except torch.OutOfMemoryError:
             if len(rows) == 1:
                 raise TrapsError(

@@ -39,9 +39,9 @@ def unknown_path(config: Any, block: Module) -> str | None:
 
     The path is described in words and by the name of its field; None if there is none.
     """
-    for field, (argument, what) in _FIELDS.items():
+    for field, (argument, path) in _FIELDS.items():
         if getattr(config, field, 0) and argument not in _arguments(type(block)):
-            return f"{what} ({field})"
+            return f"{path} ({field})"
     return None
 
 
