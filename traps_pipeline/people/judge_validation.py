@@ -173,14 +173,14 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
         raise TrapsError(
             f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
         )
-    one, other = names
+    first, second = names
     samples = sorted({sample for _, sample in by_sample})
     alone = [
-        (a, s, line) for (a, s), (line, _) in by_sample.items() if (other if a == one else one, s) not in by_sample
+        (a, s, line) for (a, s), (line, _) in by_sample.items() if (second if a == first else first, s) not in by_sample
     ]
     _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
     labels = np.array([[by_sample[name, sample][1] for sample in samples] for name in names], bool)
-    return HumanLabels((one, other), tuple(samples), labels)
+    return HumanLabels((first, second), tuple(samples), labels)
 
 
 def _refuse(wrong: Sequence[str]) -> None:
@@ -239,20 +239,20 @@ def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
 
 def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
     """Return the row of an axis. judge: (failures,); labels: (2, failures)."""
-    one, other = labels
+    first, second = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
     defined = judge.any() and labels.any()  # whether both precision and recall are defined
-    kappa, low, high = _kappa(one, other)
+    kappa, low, high = _kappa(first, second)
     return _shared(axis, len(judge), human) | {
         "n_labels": labels.size,
         "accuracy": float(np.mean(labels == judge)),
         "precision": precision,
         "recall": recall,
         "f1": _share(2 * hits, 2 * int(judge.sum()) + int(labels.sum())) if defined else np.nan,
-        "accuracy_a": float(np.mean(one == judge)),
-        "accuracy_b": float(np.mean(other == judge)),
-        "human_agreement": float(np.mean(one == other)),
+        "accuracy_a": float(np.mean(first == judge)),
+        "accuracy_b": float(np.mean(second == judge)),
+        "human_agreement": float(np.mean(first == second)),
         "human_kappa": kappa,
         "human_kappa_low": low,
         "human_kappa_high": high,
