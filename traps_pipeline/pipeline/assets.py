@@ -49,7 +49,10 @@ class WorkspaceResource(dg.ConfigurableResource):
 
 def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
     """Return an asset for each stage, and an observable one for each source."""
-    return [_asset(graph, one) if isinstance(one, Stage) else _observable(one) for one in graph.declared.values()]
+    return [
+        _asset(graph, declaration) if isinstance(declaration, Stage) else _observable(declaration)
+        for declaration in graph.declared.values()
+    ]
 
 
 def _observable(source: Source) -> dg.AssetsDefinition:

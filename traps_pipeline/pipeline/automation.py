@@ -155,12 +155,12 @@ def _requests(
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # Try each outdated partition once per set of inputs: if it stays outdated, it fails for its own reasons.
         states = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
-        for one in batches(block[0].scheme, keys):
+        for batch in batches(block[0].scheme, keys):
             requests.append(
                 dg.RunRequest(
-                    digest([*one, states])[:32],
-                    partition_key=one[0] if one[0] == one[1] else None,
-                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(one)},
+                    digest([*batch, states])[:32],
+                    partition_key=batch[0] if batch[0] == batch[1] else None,
+                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(batch)},
                     asset_selection=[asset_key(stage.name) for stage in stages],
                 )
             )

@@ -49,12 +49,12 @@ def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
         with engine.begin() as connection:
             yield connection
     except DBAPIError as error:
-        why, what, is_unwritable = reason_and_remedy(error)
+        why, remedy, is_unwritable = reason_and_remedy(error)
         if not is_unwritable or error.orig is None:
             raise
         unwritable = HistoryUnwritable(None, None, error.orig)
         unwritable.sentence = (
-            f"{engine.url.database}: Dagster's history could not be written ({why}); {what} and run the same command "
+            f"{engine.url.database}: Dagster's history could not be written ({why}); {remedy} and run the same command "
             "again: tables are whole, no answer is lost"
         )
         raise unwritable from None

@@ -69,8 +69,8 @@ class Experiment(BaseModel):
         described = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
         models = data.get("models")
         if isinstance(models, list):
-            described["models"] = [one for one in models if isinstance(one, dict)]
-            rest["models"] = [one.get("id", "?") if isinstance(one, dict) else one for one in models]
+            described["models"] = [model for model in models if isinstance(model, dict)]
+            rest["models"] = [model.get("id", "?") if isinstance(model, dict) else model for model in models]
         return rest | {"own": described}
 
     @field_validator("scenarios", mode="before")

@@ -159,14 +159,16 @@ def _local_costs(
         if settings and model in settings.models:
             inside, params = shown_inside(entry, settings), entry.inside_params()
             if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
-                work += [(inside, one, params) for one in passes_inside(settings, experiment.datasets, taxonomies)]
+                work += [
+                    (inside, passes, params) for passes in passes_inside(settings, experiment.datasets, taxonomies)
+                ]
             if settings.steering and model in steered:
                 most = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
                 work.append((inside, Work("steered answers", steered[model][0].new, most), params))
-        for media, one, params in work:
+        for media, passes, params in work:
             assert media.media is not None, "local entries have media"
-            if one.passes:
-                yield cost_of(media, media.media, one, CARDS[card], quantised=params.quantisation == "nf4")
+            if passes.passes:
+                yield cost_of(media, media.media, passes, CARDS[card], quantised=params.quantisation == "nf4")
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:

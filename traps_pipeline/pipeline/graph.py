@@ -160,24 +160,27 @@ class Graph:
     @cached_property
     def parents_of(self) -> Mapping[str, Mapping[str, Parent]]:
         """Upstream assets of each stage, by name; empty for a source."""
-        return {name: one.parents if isinstance(one, Stage) else {} for name, one in self.declared.items()}
+        return {
+            name: declaration.parents if isinstance(declaration, Stage) else {}
+            for name, declaration in self.declared.items()
+        }
 
     def __getitem__(self, name: str) -> Stage:
-        one = self.declared.get(name)
-        if not isinstance(one, Stage):
+        declaration = self.declared.get(name)
+        if not isinstance(declaration, Stage):
             known = [stage.name for stage in self.stages]
             raise TrapsError(f"no stage {name!r}{did_you_mean(name, known) or '; choose from ' + ', '.join(known)}")
-        return one
+        return declaration
 
     def source(self, name: str) -> Source | None:
         """Return the source of that name; None for a stage."""
-        one = self.declared[name]
-        return one if isinstance(one, Source) else None
+        declaration = self.declared[name]
+        return declaration if isinstance(declaration, Source) else None
 
     @cached_property
     def sources(self) -> list[str]:
         """Names of all sources."""
-        return [name for name, one in self.declared.items() if isinstance(one, Source)]
+        return [name for name, declaration in self.declared.items() if isinstance(declaration, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
         """Return stages (default: all) in order, grouped into blocks.
@@ -188,9 +191,9 @@ class Graph:
         order of `GROUPS`.
         """
         remaining = {
-            name: one
-            for name, one in self.declared.items()
-            if isinstance(one, Stage) and (names is None or name in names)
+            name: declaration
+            for name, declaration in self.declared.items()
+            if isinstance(declaration, Stage) and (names is None or name in names)
         }
         above = {name: {p for p in self.parents_of[name] if p in remaining} for name in remaining}
         result: list[list[Stage]] = []

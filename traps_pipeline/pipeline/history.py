@@ -67,7 +67,7 @@ class History:
         # One query over the index of tags: ten thousand events take seconds to deserialize.
         kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MADE
         tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])
-        return {key: of[_VERSION] for key, of in tags.items()}
+        return {key: key_tags[_VERSION] for key, key_tags in tags.items()}
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
         """Report versions of sources that Dagster lacks; return the changed sources.

@@ -49,8 +49,10 @@ def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: St
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in selected}
-    alike = [other for other in the_graph().stages if other.name in names and other.scheme is stage.scheme]
-    return {other.name: [key for key in other.wanted(partitions) if key in keys] for other in alike}
+    alike = [
+        candidate for candidate in the_graph().stages if candidate.name in names and candidate.scheme is stage.scheme
+    ]
+    return {candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in alike}
 
 
 def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:

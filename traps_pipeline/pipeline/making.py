@@ -92,11 +92,11 @@ class PartitionMaker:
         The work is added to the tally.
         """
         try:
-            done, is_whole = shared.files(self._workspace, key, wait)
+            count, is_whole = shared.files(self._workspace, key, wait)
         except TrapsError as error:
             self.unmade[key] = error
             return False
-        tally.add(done)
+        tally.add(count)
         return is_whole
 
     def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:

@@ -86,17 +86,17 @@ class _Shared:
             self._pieces = {}
             with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
                 self._pieces = _read(self._path.read_bytes())
-        wanted = digest([inputs, *self._libraries])
+        inputs_digest = digest([inputs, *self._libraries])
         known, content = self._pieces.get(piece.name, ("", b""))
-        if known != wanted:
+        if known != inputs_digest:
             content = piece.make()
-            self._pieces[piece.name], self._is_new = (wanted, content), True
+            self._pieces[piece.name], self._is_new = (inputs_digest, content), True
         return content
 
     def keep(self) -> None:
         """Store the newly built pieces."""
         if self._pieces and self._is_new:
-            inputs = {name: of for name, (of, _) in self._pieces.items()}
+            inputs = {name: inputs_digest for name, (inputs_digest, _) in self._pieces.items()}
             contents = {name: content for name, (_, content) in self._pieces.items()}
             with suppress(OSError, RuntimeError):
                 write_bytes(self._path, _archive(inputs, contents))

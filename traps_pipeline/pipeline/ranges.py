@@ -85,12 +85,12 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
     if scheme is None or not keys:
         return [(key, key) for key in keys]
     grid = _Grid.of(scheme)
-    wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
+    is_wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
     for row, column in grid.cells(keys):
-        wanted[row, column] = True
+        is_wanted[row, column] = True
     heads = np.array([name.partition("__")[0] for name in grid.columns])
-    by_model = most < len({*heads[wanted.any(axis=0)]})
-    return [grid.range(*corners) for corners in _parts(wanted, heads, 0, 0, most, by_model=by_model)]
+    by_model = most < len({*heads[is_wanted.any(axis=0)]})
+    return [grid.range(*corners) for corners in _parts(is_wanted, heads, 0, 0, most, by_model=by_model)]
 
 
 def _parts(

@@ -80,14 +80,14 @@ class RunsHere(Runs):
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
-        for number, one in enumerate(ranges, start=1):
+        for number, keys in enumerate(ranges, start=1):
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
-            which = "" if one[0] is None else one[0] if one[0] == one[1] else f"{one[0]} to {one[1]}"
-            self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {which}")
-            outcome = self._execute(stages, one, tags, run_id)
+            words = "" if keys[0] is None else keys[0] if keys[0] == keys[1] else f"{keys[0]} to {keys[1]}"
+            self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {words}")
+            outcome = self._execute(stages, keys, tags, run_id)
             result = "; ".join(outcome.problems) or "made"
             self._log(f"run {run_id}: {result}")
-            self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
+            self.finished.append({"run": run_id, "assets": names, "partitions": words, "result": result})
             yield outcome
 
     def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
@@ -177,7 +177,7 @@ def reason(error: Any) -> str:
     It is our own sentence if it contains one, else its innermost cause.
     """
     chain = _chain(error)
-    readable = [one for one in chain if one.cls_name in _SENTENCES]
+    readable = [link for link in chain if link.cls_name in _SENTENCES]
     if not readable:
         return chain[-1].message.strip() if chain else "the step failed"
     return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

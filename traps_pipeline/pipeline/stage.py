@@ -65,9 +65,9 @@ def source(
     """Declare a source by the function of its name, which returns its data version."""
 
     def declare(version: Callable[[Workspace, Any], str]) -> Source:
-        one = Source(version.__name__, version, group, _result(_doc(version)), kinds, scheme)
-        _declare(one)
-        return one
+        declaration = Source(version.__name__, version, group, _result(_doc(version)), kinds, scheme)
+        _declare(declaration)
+        return declaration
 
     return declare
 

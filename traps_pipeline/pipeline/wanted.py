@@ -146,7 +146,7 @@ class StudyPartitions:
         asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
         existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
         existing |= {
-            dataset for dataset, of in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if of in existing
+            dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
         }
         return [d for d in PROBED_DATASETS if d in existing]
 

@@ -224,8 +224,8 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
         cell = SteeringCell.parse(key)
         entry = examined_model(workspace, cell.evaluation.model)
         along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
-        for done, output in collect_steered(workspace, entry, [cell], along):
-            yield done.key, output
+        for finished, output in collect_steered(workspace, entry, [cell], along):
+            yield finished.key, output
 
 
 @_stage(
@@ -243,8 +243,8 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
     """
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
-    for done, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
-        yield done.key, output
+    for finished, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield finished.key, output
 
 
 def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
