@@ -49,9 +49,9 @@ class Ratings:
         items: rows with the columns `answer`. Two arrays: values, (items, judges), all INVALID for an item that was not
         judged; and whether it was judged, (items,).
         """
-        by = [*self.answer]
-        judged = self.answers.loc[self.answers["task"].isin(tasks), by]
-        merged = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
+        keys = [*self.answer]
+        judged = self.answers.loc[self.answers["task"].isin(tasks), keys]
+        merged = items[keys].merge(judged.assign(row=judged.index), on=keys, how="left", validate="many_to_one")
         rows = merged["row"].to_numpy(float)
         is_judged = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
@@ -109,8 +109,8 @@ def majority(values: np.ndarray) -> np.ndarray:
     INVALID without such a majority.
     """
     half = values.shape[1] / 2
-    yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
-    return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)
+    is_yes, is_no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
+    return np.where(is_yes, YES, np.where(is_no, NO, INVALID)).astype(np.int8)
 
 
 def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
