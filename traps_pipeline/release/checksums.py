@@ -77,6 +77,6 @@ def altered_files(folder: Path) -> list[str]:
         elif (folder / name).is_symlink():
             problems.append(f"{name}: is a link, not a file")
         elif file_digest(folder / name) != expected[name]:
-            same = [other for other, sha256 in expected.items() if sha256 == file_digest(folder / name)]
-            problems.append(f"{name}: is {f'in truth {same[0]}' if same else 'altered'}")
+            same_files = [known_name for known_name, sha256 in expected.items() if sha256 == file_digest(folder / name)]
+            problems.append(f"{name}: is {f'in truth {same_files[0]}' if same_files else 'altered'}")
     return problems

@@ -207,7 +207,7 @@ def identifying() -> dict[str, str]:
     """
     data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
-    names = [f"{one['given-names']} {one['family-names']}" for one in paper["authors"]]
+    names = [f"{author['given-names']} {author['family-names']}" for author in paper["authors"]]
     words = {paper["url"]: "(address withheld)", paper["title"]: "(title withheld)", data["title"]: "(title withheld)"}
     words |= {paper["collection-title"]: "(venue withheld)", paper["conference"]["name"]: "(venue withheld)"}
     return words | {", ".join(names): "Anonymous authors"} | dict.fromkeys(names, "Anonymous authors")

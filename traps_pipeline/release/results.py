@@ -123,7 +123,7 @@ def _ever_record(
             "developer": who.developer_of(model),
             "additional_details": _UNKNOWN,
         },
-        "evaluation_results": [one for row in rows for one in _ever_results(row, dataset, release)],
+        "evaluation_results": [result for row in rows for result in _ever_results(row, dataset, release)],
     }
 
 

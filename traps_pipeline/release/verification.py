@@ -103,10 +103,10 @@ def verify(submission: Submission, release: Path | None = None) -> Verification:
 def _wrong_items(items: Any) -> Iterator[str]:
     for row in items:
         try:
-            same = item_hash(row) == row["item_hash"]
+            is_same = item_hash(row) == row["item_hash"]
         except (ValueError, RecursionError):
-            same = False
-        if not same or row["item_id"] != f"{row['dataset']}:{row['scenario_id']}:{row['side']}":
+            is_same = False
+        if not is_same or row["item_id"] != f"{row['dataset']}:{row['scenario_id']}:{row['side']}":
             yield f"item {row['item_id']}: is not what its digest says"
         elif row["dataset"] not in DATASETS:
             yield f"item {row['item_id']}: is none of the pairs'"
@@ -297,16 +297,16 @@ def _numbers(verified: Verification, submission: Submission) -> None:
 
 def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
-    theirs, ours = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in (stated, own))
-    for entry in sorted({*theirs, *ours}, key=str):
+    stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in (stated, own))
+    for entry in sorted({*stated_rows, *own_rows}, key=str):
         name = f"{table.name} {' '.join(map(str, entry))}"
-        if entry not in ours or entry not in theirs:
-            yield f"{name}: {'has no votes' if entry not in ours else 'is left out'}"
+        if entry not in own_rows or entry not in stated_rows:
+            yield f"{name}: {'has no votes' if entry not in own_rows else 'is left out'}"
             continue
         for column in table.columns:
-            one, other = theirs[entry][column.name], ours[entry][column.name]
-            if not _equal(one, other):
-                yield f"{name}: {column.name} is {one!r:.40}, the votes give {other!r:.40}"
+            stated_value, own_value = stated_rows[entry][column.name], own_rows[entry][column.name]
+            if not _equal(stated_value, own_value):
+                yield f"{name}: {column.name} is {stated_value!r:.40}, the votes give {own_value!r:.40}"
 
 
 def _equal(one: Any, other: Any) -> bool:

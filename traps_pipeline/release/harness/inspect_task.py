@@ -68,7 +68,7 @@ def traps_figures() -> Any:
     """Return the metric: PECS and its factors, overall and by dataset."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        results = figures(PanelDecision.of(one.score.metadata) for one in scores)
+        results = figures(PanelDecision.of(score.score.metadata) for score in scores)
         return {name: value for name, value in results.items() if value is not None}
 
     return compute

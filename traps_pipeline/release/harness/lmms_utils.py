@@ -48,7 +48,7 @@ def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, reg
     """
     visuals = doc_to_visual(doc)
     kind = "video" if isinstance(visuals[0], str) else "image"
-    content = [{"type": kind, "url": one} for one in visuals]
+    content = [{"type": kind, "url": visual} for visual in visuals]
     return [
         {"role": "system", "content": [{"type": "text", "text": prompt(regime)}]},
         {"role": "user", "content": [*content, {"type": "text", "text": doc["question"]}]},
