@@ -74,12 +74,12 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
     own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
     for row in (*pair.to_dict("records"), *own.to_dict("records")):
-        frames, at = decode(root / str(row["clip"]))
+        frames, times_s = decode(root / str(row["clip"]))
         truth = row["ground_truth"]
         name = str(row.get("arm") or row["side"])
         right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
         right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else right
-        yield Row(name, right, str(row["question"]), sampled(frames, at, times))
+        yield Row(name, right, str(row["question"]), sampled(frames, times_s, times))
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:

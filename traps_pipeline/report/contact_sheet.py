@@ -126,10 +126,10 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
 
     The times are (moments,), in seconds.
     """
-    control, at = decode(root / str(pair.at["control", "clip"]))
+    control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
-    times = telling_times(control, at, moments)
-    return sampled(control, at, times), sampled(void, void_at, times), times
+    times = telling_times(control, times_s, moments)
+    return sampled(control, times_s, times), sampled(void, void_at, times), times
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
@@ -197,8 +197,8 @@ def draw_pair(
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Draw scenario and ground truth in bold, and the questions below them."""
     by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
-    same = by_side["control"] == by_side["void"]
-    questions = [by_side["control"]] if same else [f"{side}: {question}" for side, question in by_side.items()]
+    is_same = by_side["control"] == by_side["void"]
+    questions = [by_side["control"]] if is_same else [f"{side}: {question}" for side, question in by_side.items()]
     fit = {"max_lines": layout.questions, "placeholder": " …"}
     lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]

@@ -160,15 +160,15 @@ def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
     ranked = next((name for name in TITLES if name in datasets), "overall")
-    others = [name for name in DATASETS if name in datasets and name != ranked]
-    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in others]
+    other_datasets = [name for name in DATASETS if name in datasets and name != ranked]
+    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in other_datasets]
     rows = []
     if robust is not None and ranked == "overall":
         rows = records(robust)
     beside = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
     beside = {key: row for key, row in beside.items() if key in entries}
-    return [_leaderboard(board, ranked, others, beside, brief, suffix), *own]
+    return [_leaderboard(board, ranked, other_datasets, beside, brief, suffix), *own]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
@@ -204,9 +204,9 @@ def judged_by(board: pd.DataFrame) -> str:
     sentence = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
     sentence += "; figures of different panels are not ranked or compared" * several
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
-    others = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
-    names_shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if others else "")
+    by_rules = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
+    names_shown = ", ".join(by_rules[:5]) + (f" and {len(by_rules) - 5} more" if len(by_rules) > 5 else "")
+    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if by_rules else "")
 
 
 def _panel_in_words(panel: str) -> str:

@@ -60,11 +60,13 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
         figure = fraction(first["pecs"])
-        equal, others = ([*part.loc[part["pecs"].map(fraction).eq(figure) == same, "model"]] for same in (True, False))
-        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if others else "has a PECS of"
+        equal, worse = (
+            [*part.loc[part["pecs"].map(fraction).eq(figure) == is_equal, "model"]] for is_equal in (True, False)
+        )
+        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse else "has a PECS of"
         text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
-        if others:
-            text += f", before {others[0]} with {fraction(part.loc[part['model'] == others[0], 'pecs'].iloc[0])}"
+        if worse:
+            text += f", before {worse[0]} with {fraction(part.loc[part['model'] == worse[0], 'pecs'].iloc[0])}"
         alike = ranks(first)
         if len(equal) == 1 and "–" in alike:
             text += f"; its rank may be {alike}, since contrasts do not separate it from others"
@@ -82,10 +84,10 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     for regime, words in ASKED.items():
         part = rows.loc[rows["regime"] == regime]
         if len(part):
-            who = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
+            subject = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
             voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
             yield StudyFinding(
-                f"{words}, {who} on {voids} of the voids, which cannot be answered, and on {controls} of the "
+                f"{words}, {subject} on {voids} of the voids, which cannot be answered, and on {controls} of the "
                 "controls, which can.",
                 "figure-abs_rec",
             )
@@ -116,9 +118,9 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     pooled = pooled.dropna(subset=["visual", "textual"])
     if len(pooled):
         textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
-        who = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
+        subject = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
         yield StudyFinding(
-            f"Asked plainly, {who} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
+            f"Asked plainly, {subject} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
             f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
             f"{' (means)' if len(pooled) > 1 else ''}.",
             "figure-visual_textual",
@@ -138,8 +140,10 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     contrasts = results.contrasts
     if len(contrasts):
         models = contrasts["left_model"].isin(rows["model"]) & contrasts["right_model"].isin(rows["model"])
-        of = contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
-        tested = contrasts.loc[models & of & contrasts["difference"].notna()]
+        is_comparison = (
+            contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
+        )
+        tested = contrasts.loc[models & is_comparison & contrasts["difference"].notna()]
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(

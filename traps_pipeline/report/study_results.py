@@ -126,8 +126,8 @@ def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
 
     Means are taken over these.
     """
-    others = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
-    return others if len(others) else rows
+    kept_rows = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
+    return kept_rows if len(kept_rows) else rows
 
 
 class StudyResults(Results):

@@ -115,9 +115,9 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     decided = ("outcome", "abstained", "correct", "unanimous")
     verdicts = _keyed(_of_items(workspace, VERDICTS, decided, items), evaluations)
     judged = verdicts["key"].to_numpy()
-    at = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
-    at[judged] = np.arange(len(judged))
-    places = at[keys]
+    positions = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
+    positions[judged] = np.arange(len(judged))
+    places = positions[keys]
     judged_as = pc.take(verdicts["outcome"], pa.array(places, mask=places < 0))
     is_unread = pc.fill_null(pc.equal(judged_as, UNREAD), False)
     outcomes, outcome = _coded(pc.if_else(is_unread, judged_as, responses["outcome"]))
@@ -132,9 +132,9 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
         "unanimous": _decision(verdicts["unanimous"], places) == YES,
     }
     votes = _keyed(_of_items(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
-    at[:] = -1
-    at[keys] = np.arange(len(keys))
-    votes = votes.append_column("answer", pa.array(at[votes["key"].to_numpy()].astype(np.int32)))
+    positions[:] = -1
+    positions[keys] = np.arange(len(keys))
+    votes = votes.append_column("answer", pa.array(positions[votes["key"].to_numpy()].astype(np.int32)))
     votes = votes.filter(pc.greater_equal(votes["answer"], 0))
     votes = votes.sort_by([(name, "ascending") for name in ("answer", "task", "judge")])
     return StudyAnswers(

@@ -24,8 +24,8 @@ def answer_of_control(spec: Mapping[str, Any]) -> str:
 
 def intervention(spec: Mapping[str, Any]) -> str:
     """Return how the control's clip was changed to make the void."""
-    at = f"{spec['void_from_s']:.1f} s"
-    return f"hidden from {at}" if spec["void_kind"] == "occluder" else f"cut at {at}"
+    moment = f"{spec['void_from_s']:.1f} s"
+    return f"hidden from {moment}" if spec["void_kind"] == "occluder" else f"cut at {moment}"
 
 
 _PHRASES = {

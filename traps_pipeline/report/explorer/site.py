@@ -298,8 +298,8 @@ def script() -> str:
     Raises TrapsError for an unknown bundle.
     """
     library = LIBRARY.read_bytes()
-    wanted = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
-    if hashlib.sha256(library).hexdigest() != wanted:
+    expected_sha256 = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
+    if hashlib.sha256(library).hexdigest() != expected_sha256:
         raise TrapsError(f"{LIBRARY}: is not what was checked in; restore it from git, or run `make explorer-vendor`")
     sources = "\n".join((WEB / name).read_text(encoding="utf-8") for name in _SOURCES)
     return f'{library.decode("utf-8")}\n(() => {{\n"use strict";\n{sources}\n}})();\n'

@@ -68,12 +68,12 @@ def beside(results: Results) -> pd.DataFrame:
     """
     import pandas as pd
 
-    wanted = pd.DataFrame(
+    selected = pd.DataFrame(
         [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
         columns=pd.Index(["source", "target", "analysis"]),
     )
     probe = results.probes.loc[results.probes["chosen"].eq(True)]
-    return _with_baselines(results, probe.merge(wanted, on=["source", "target", "analysis"]))
+    return _with_baselines(results, probe.merge(selected, on=["source", "target", "analysis"]))
 
 
 def look_alikes(results: Results) -> pd.DataFrame:

@@ -66,19 +66,23 @@ def judge_bias(results: Results) -> list[PrintedTable]:
         Column("dissent_yes", "Yes against it %", "percent", 2), Column("dissent_no", "No against it %", "percent", 2),
         Column("n_votes", "Votes", "count"), Column("n_invalid", "Invalid", "count"),
     ]  # fmt: skip
-    left = results.leave_one_out
-    left = left.loc[left["dataset"] == "overall"] if "overall" in set(left["dataset"]) else left
-    left = ordered(with_titles(left), ["model", "regime", "without"])
+    leave_one_out = results.leave_one_out
+    leave_one_out = (
+        leave_one_out.loc[leave_one_out["dataset"] == "overall"]
+        if "overall" in set(leave_one_out["dataset"])
+        else leave_one_out
+    )
+    leave_one_out = ordered(with_titles(leave_one_out), ["model", "regime", "without"])
     without = [
         MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
     ]  # fmt: skip
-    notes = ["two judges: one against one is undecided and counts as missing", epochs(left)]
+    notes = ["two judges: one against one is undecided and counts as missing", epochs(leave_one_out)]
     why = results.why("bias")
     return [
         PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], why, _task_trace),
-        PrintedTable("leave_one_judge_out", "PECS without one judge", left, without, notes, why, cell_trace),
+        PrintedTable("leave_one_judge_out", "PECS without one judge", leave_one_out, without, notes, why, cell_trace),
     ]
 
 

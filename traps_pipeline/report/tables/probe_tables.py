@@ -94,17 +94,17 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     transfers = by_pair("transfer", rows["model"].notna())
     known = rows["value"].notna()
-    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in PAIR_FIGURES.items()}
+    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & known) for name, rule in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
         | {
             f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
-            for name, at in PAIR_FIGURES.items()
-            for c in at.columns
+            for name, rule in PAIR_FIGURES.items()
+            for c in rule.columns
         }
-        | {"note": next((of[key]["note"] for of in notes if key in of), "")}
+        | {"note": next((notes_of[key]["note"] for notes_of in notes if key in notes_of), "")}
         for model in rows["model"].unique()
         for key in ((str(model), *pair) for pair in TRANSFER_PAIRS)
         if key in transfers
@@ -368,9 +368,9 @@ def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     import pandas as pd
 
     parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()
-    for model, of in rows.groupby("model", sort=False):
-        curves = pair_curves({str(name): value for name, value in row.items()} for row in of.to_dict("records"))
-        within = of.loc[of["analysis"] == "within", ["source", "layer", "value"]]
+    for model, group in rows.groupby("model", sort=False):
+        curves = pair_curves({str(name): value for name, value in row.items()} for row in group.to_dict("records"))
+        within = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
         if not curves or not len(within):
             continue
         part = within.assign(top=within["value"] >= within.groupby("source")["value"].transform("max") - ROUNDING)

@@ -73,14 +73,14 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
 
 def _sent(entry: Entry, role: str) -> dict[str, Any]:
     named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
-    other = {name: value for name, value in entry.params.items() if name not in named}
+    other_params = {name: value for name, value in entry.params.items() if name not in named}
     return {
         "id": entry.id,
         "role": role,
         "temperature": entry.params.get("temperature"),
         "top_p": entry.params.get("top_p"),
         "max_tokens": entry.max_tokens or None,
-        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other.items())),
+        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other_params.items())),
         "concurrency": entry.limits.concurrency,
         "retries": entry.limits.retries,
         "waived": "; ".join(f"{name}: {reason}" for name, reason in sorted(entry.waivers.items())),

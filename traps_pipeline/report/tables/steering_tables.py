@@ -47,8 +47,8 @@ def cosines(results: Results) -> list[PrintedTable]:
     """
     rows = results.cosines
     order = [*SHORT]
-    place, other = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
-    rows = rows.assign(step=np.subtract(other, place))
+    place, other_place = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
+    rows = rows.assign(step=np.subtract(other_place, place))
     across = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
     rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | across]
     own = ["model", "prompt", "dataset"]
