@@ -170,9 +170,9 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
 
 def _dominated(points: pd.DataFrame) -> np.ndarray:
     """Return which rows another row dominates in (acc, j): (rows,) bool."""
-    at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
-    no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
-    better = (at[None] > at[:, None]).any(-1)
+    values = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
+    no_worse = (values[None] >= values[:, None]).all(-1)  # [i, k]: k is no worse than i in both
+    better = (values[None] > values[:, None]).any(-1)
     return np.any(no_worse & better, axis=1)
 
 
@@ -268,14 +268,14 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
     by_model = cells.set_index(_ENTRY)
     rows = []
-    for thinking, other in REASONING_PAIRS:
-        if not {thinking, other} <= set(cells["model"]):
+    for thinking, plain in REASONING_PAIRS:
+        if not {thinking, plain} <= set(cells["model"]):
             continue
-        sides = {name: by_model.loc[name] for name in (thinking, other)}
+        sides = {name: by_model.loc[name] for name in (thinking, plain)}
         epochs = pd.DataFrame({name: side["epoch"] for name, side in sides.items()}).dropna()
-        require_one_epoch(epochs, f"{thinking} against {other}")
-        change = (sides[thinking][SHARES] - sides[other][SHARES]).loc[epochs.index].reset_index()
-        rows.append(change.assign(thinking=thinking, other=other))
+        require_one_epoch(epochs, f"{thinking} against {plain}")
+        change = (sides[thinking][SHARES] - sides[plain][SHARES]).loc[epochs.index].reset_index()
+        rows.append(change.assign(thinking=thinking, other=plain))
     columns = ["thinking", "other", "regime", "dataset", *SHARES]
     return pd.concat(rows, ignore_index=True).loc[:, columns] if rows else pd.DataFrame(columns=pd.Index(columns))
 

@@ -111,8 +111,8 @@ def claims() -> Iterator[AuditFinding]:
     """
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
-        same = _same_words(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
-        verdict: Verdict = AGREES if same else DIFFERS
+        is_same = _same_words(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
+        verdict: Verdict = AGREES if is_same else DIFFERS
         reason = recomputed.reason if verdict == DIFFERS else ""
         if verdict == DIFFERS and recomputed.agrees is None:
             reason = f"{_differences(printed, recomputed.words)}{'; ' + reason if reason else ''}"
@@ -122,10 +122,12 @@ def claims() -> Iterator[AuditFinding]:
 
 def _same_words(printed: str, recomputed: str) -> bool:
     """Return whether two texts agree at the printed digits and name the same things."""
-    ours, theirs = _numbers(recomputed), _numbers(printed)
-    if len(ours) != len(theirs):
+    own_numbers, printed_numbers = _numbers(recomputed), _numbers(printed)
+    if len(own_numbers) != len(printed_numbers):
         return False
-    close = all(abs(float(a) - float(b)) <= _half_unit(b) + _SLACK for a, b in zip(ours, theirs, strict=True))
+    close = all(
+        abs(float(a) - float(b)) <= _half_unit(b) + _SLACK for a, b in zip(own_numbers, printed_numbers, strict=True)
+    )
     return close and _names(printed) == _names(recomputed)
 
 
@@ -147,10 +149,12 @@ def _half_unit(number: str) -> float:
 
 
 def _differences(printed: str, recomputed: str) -> str:
-    ours, theirs = _numbers(recomputed), _numbers(printed)
-    if len(ours) != len(theirs) or not ours:
+    own_numbers, printed_numbers = _numbers(recomputed), _numbers(printed)
+    if len(own_numbers) != len(printed_numbers) or not own_numbers:
         return "not what the tables give"
-    return "differs by " + " and ".join(f"{float(a) - float(b):+.3g}" for a, b in zip(ours, theirs, strict=True))
+    return "differs by " + " and ".join(
+        f"{float(a) - float(b):+.3g}" for a, b in zip(own_numbers, printed_numbers, strict=True)
+    )
 
 
 def _shown(words: str) -> str:
@@ -179,16 +183,16 @@ def overall_means() -> Iterator[AuditFinding]:
         model, regime = row["model"], row["regime"]
         for share in SHARES:
             scale, digits, unit = (1, 3, 0.001) if share == "pecs" else (100, int(share == "false_abs"), 0.1)
-            value, theirs = float(ours[model, regime][share]) * scale, float(row[share]) * scale
-            off, half = abs(value - theirs), 0.5 * 10.0**-digits
+            value, printed_value = float(ours[model, regime][share]) * scale, float(row[share]) * scale
+            off, half = abs(value - printed_value), 0.5 * 10.0**-digits
             verdict: Verdict = (
                 AGREES if off <= half + _SLACK else ROUNDING if off <= half + unit / 2 + _SLACK else DIFFERS
             )
             parts = of_entry[model, regime][share] * scale
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
-            reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
+            reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - printed_value:+.2g}"
             name = f"overall {share} of {model}, {regime}"
-            figures = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
+            figures = f"{printed_value:.{digits}f}", f"{value:.{digits + 2}f}"
             yield AuditFinding("overall", name, *figures, verdict, reason, _line("overall"))
 
 
@@ -298,16 +302,20 @@ def steering_means() -> Iterator[AuditFinding]:
     (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
     for side in ("control", "void"):
         for alpha in (0, 10):
-            theirs = printed[f"{side}_alpha{alpha}"]
+            printed_value = printed[f"{side}_alpha{alpha}"]
             ours = fmean(row[f"{side}_abstention_pct"] for row in published_rows("steering_dose_gemma", alpha=alpha))
-            same, below = abs(ours - theirs) <= 0.5 + _SLACK, ours < theirs
-            verdict: Verdict = AGREES if same else DECLARED if below else DIFFERS
+            is_same, below = abs(ours - printed_value) <= 0.5 + _SLACK, ours < printed_value
+            verdict: Verdict = AGREES if is_same else DECLARED if below else DIFFERS
             where = (
                 "as the paper declares of the verification run" if below else "though the paper says that it lies below"
             )
-            reason = "" if same else f"lies {abs(ours - theirs):.3g} points {'below' if below else 'above'}, {where}"
+            reason = (
+                ""
+                if is_same
+                else f"lies {abs(ours - printed_value):.3g} points {'below' if below else 'above'}, {where}"
+            )
             statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
-            yield AuditFinding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
+            yield AuditFinding("steering", statement, f"{printed_value:g}", f"{ours:g}", verdict, reason, "1418")
 
 
 def steering_families() -> Iterator[AuditFinding]:
@@ -322,15 +330,16 @@ def steering_families() -> Iterator[AuditFinding]:
         by_family = group.set_index("direction_family")
         for side in ("control", "void"):
             column = f"{side}_alpha10"
-            theirs = float(by_family.loc["all", column])
+            printed_value = float(by_family.loc["all", column])
             families = [float(by_family.loc[family, column]) for family in ("oc", "ch")]
             ours = sum(families) / 2
-            verdict: Verdict = AGREES if abs(ours - theirs) <= 1 + _SLACK else DIFFERS  # three roundings to a whole
+            # Three roundings to a whole.
+            verdict: Verdict = AGREES if abs(ours - printed_value) <= 1 + _SLACK else DIFFERS
             sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
             yield AuditFinding(
-                "steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
+                "steering", statement, f"{printed_value:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
             )
 
 

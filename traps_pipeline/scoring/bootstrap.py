@@ -315,7 +315,7 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
             totals[key] = totals.get(key, 0) + sums
             having[key] = having.get(key, 0) + n
     unseen = {
-        dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {of for of, _ in totals}
+        dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {name for name, _ in totals}
     }
     return {key: with_unseen(sums, having[key], unseen[key[0]]) for key, sums in totals.items()}
 

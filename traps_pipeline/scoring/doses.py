@@ -235,10 +235,10 @@ def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
 
     They have other campaigns (docs/spec.md 9.2), panels or runs.
     """
-    for what, column in (("epoch", "epoch"), ("panel", "panel")):
-        own, other = (joined_epochs(some[column]) for some in (dose, reference))
-        if own != other or "+" in own:
-            return f"the dose is of {what} {own}, its reference of {what} {other}"
+    for word, column in (("epoch", "epoch"), ("panel", "panel")):
+        dose_epochs, reference_epochs = (joined_epochs(some[column]) for some in (dose, reference))
+        if dose_epochs != reference_epochs or "+" in dose_epochs:
+            return f"the dose is of {word} {dose_epochs}, its reference of {word} {reference_epochs}"
     runs = [sorted(set(some["run"])) for some in (dose, reference)]
     return None if runs[0] == runs[1] else f"the dose has runs {runs[0]}, its reference has runs {runs[1]}"
 
@@ -254,10 +254,15 @@ def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
     remarks = []
     for row in rows.to_dict("records"):
-        same = [one for one in of_rules if all(one[name] == row[name] for name in ("hypothesis", "dose"))]
-        own = {one["model"]: one for one in sorted(same, key=lambda one: one["regime"] == row["regime"])}
+        matching = [
+            rule_row for rule_row in of_rules if all(rule_row[name] == row[name] for name in ("hypothesis", "dose"))
+        ]
+        own = {
+            rule_row["model"]: rule_row
+            for rule_row in sorted(matching, key=lambda rule_row: rule_row["regime"] == row["regime"])
+        }
         remarks.append({**_best(own.values(), "value", "rule"), **_best(own.values(), "change", "rule_changing")})
-    return rows.assign(**{name: [one[name] for one in remarks] for name in remarks[0]}) if remarks else rows
+    return rows.assign(**{name: [rule_row[name] for rule_row in remarks] for name in remarks[0]}) if remarks else rows
 
 
 def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str, Any]:

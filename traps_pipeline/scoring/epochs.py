@@ -86,8 +86,9 @@ def refusal(left: Answered, right: Answered) -> str | None:
         return f"{_named(alone)} answered on one side alone; both sides of a contrast are of the same items"
     mixed = sorted(item for item, origin in left.items() if right[item].epoch != origin.epoch)
     if not mixed:
-        one, other = (" and ".join(names) for names in panels)
-        return f"judged by {one} on one side and by {other} on the other; figures of different panels are not compared"
+        left_names, right_names = (" and ".join(names) for names in panels)
+        judged = f"judged by {left_names} on one side and by {right_names} on the other"
+        return f"{judged}; figures of different panels are not compared"
     epochs = f"epoch {left[mixed[0]].epoch} against epoch {right[mixed[0]].epoch}"
     return f"{_named(mixed)} of {epochs}; figures of different epochs are never put in one contrast"
 

@@ -73,11 +73,11 @@ class GradedItem:
             if label is None or label in stated:
                 return None
             stated[label] = number
-        others = [label for label in self.labels if label not in stated]
-        left = 1 - sum(stated.values())
-        if left < -SUM_WITHIN or (left > SUM_WITHIN and not others):
+        unstated = [label for label in self.labels if label not in stated]
+        remainder = 1 - sum(stated.values())
+        if remainder < -SUM_WITHIN or (remainder > SUM_WITHIN and not unstated):
             return None
-        stated |= dict.fromkeys(others, max(0.0, left) / max(1, len(others)))
+        stated |= dict.fromkeys(unstated, max(0.0, remainder) / max(1, len(unstated)))
         return {label: stated[label] / sum(stated.values()) for label in self.labels}
 
     def read_first_token(self, alternatives: object) -> dict[str, float] | None:
@@ -95,10 +95,10 @@ class GradedItem:
         known = dict.fromkeys(self.labels, 0.0)
         for token, logprob in json.loads(alternatives).items():
             start = token.strip().strip("\"'*`.,:").casefold()
-            begun = {label for name, label in names.items() if start and name.startswith(start)}
-            begun = {names[start]} if start in names else begun
-            if len(begun) == 1:
-                known[begun.pop()] += exp(logprob)
+            matching = {label for name, label in names.items() if start and name.startswith(start)}
+            matching = {names[start]} if start in names else matching
+            if len(matching) == 1:
+                known[matching.pop()] += exp(logprob)
         total = sum(known.values())
         rest = max(0.0, 1 - total) / len(known)
         return {label: (p + rest) / max(1.0, total) for label, p in known.items()}
@@ -240,20 +240,20 @@ def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, A
     A scenario counts once, with the mean over its runs.
     """
     with_decision = items.loc[items["points"].notna()]
-    of = with_decision.groupby("scenario_id")[_FIGURES].mean()
+    scenario_means = with_decision.groupby("scenario_id")[_FIGURES].mean()
     row: dict[str, Any] = {
         "n_runs": with_decision["run"].nunique(),
-        "n_items": len(of),
+        "n_items": len(scenario_means),
         "n_missing": len(items) - len(with_decision),
-        "coverage": of["answers"].mean(),
+        "coverage": scenario_means["answers"].mean(),
         "risk": with_decision["wrong"].mean(),
-        **of[[*_MEANS]].mean(),
+        **scenario_means[[*_MEANS]].mean(),
         "panel": joined_epochs(items["panel"]),
         "epoch": joined_epochs(items["epoch"]),
         "benchmark_version": joined_versions(items["benchmark_version"]),
     }
     for name, (low, high) in WITH_INTERVAL.items():
-        ends = ends_of_mean((of[name].dropna() - low) / (high - low), resampling, f"{named}|{name}")
+        ends = ends_of_mean((scenario_means[name].dropna() - low) / (high - low), resampling, f"{named}|{name}")
         row |= with_interval(name, low + (high - low) * ends, (low, high))
     return row
 

@@ -192,16 +192,16 @@ def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return the denominator of each share, and the share's interval: (cells,) each."""
     columns = {}
     for figure, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
-        of = sums[f"{name}_of"].to_numpy("int64")
-        low, high = wilson(sums[name].to_numpy(float), of.astype(float))
-        columns |= {f"n_{figure}": of, f"{figure}_low": low, f"{figure}_high": high}
+        totals = sums[f"{name}_of"].to_numpy("int64")
+        low, high = wilson(sums[name].to_numpy(float), totals.astype(float))
+        columns |= {f"n_{figure}": totals, f"{figure}_low": low, f"{figure}_high": high}
     return columns
 
 
 def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
     """Return numerator over denominator, (cells,); NaN where the denominator is 0."""
-    of = sums[f"{name}_of"].to_numpy(float)
-    return sums[name].to_numpy(float) / np.where(of > 0, of, np.nan)
+    totals = sums[f"{name}_of"].to_numpy(float)
+    return sums[name].to_numpy(float) / np.where(totals > 0, totals, np.nan)
 
 
 def wrong_figures(cells: pd.DataFrame) -> int:

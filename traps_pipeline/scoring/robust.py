@@ -141,8 +141,8 @@ def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
 
     def mean_over_kinds(figure: str, weights: Mapping[str, float]) -> np.ndarray:
-        at = RESAMPLED.index(figure)
-        kinds = [pairs[:, at], *(cells[arm][:, at] for arm in weights)]
+        position = RESAMPLED.index(figure)
+        kinds = [pairs[:, position], *(cells[arm][:, position] for arm in weights)]
         return np.average(kinds, axis=0, weights=[1.0, *weights.values()])
 
     acc, false_abs = (mean_over_kinds(figure, arms) for figure in ("acc", "false_abs"))
