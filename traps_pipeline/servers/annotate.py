@@ -107,12 +107,12 @@ class Annotation:
         waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
         met = {each.scenario_id for each in seen if each.at > since}  # in any task, since answers reveal clips
-        done = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
+        finished = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
         open_units = (
             unit
             for unit in queue_of(who, own)
-            if unit not in done and (blind or own.loc[unit, "scenario_id"] not in met)
+            if unit not in finished and (blind or own.loc[unit, "scenario_id"] not in met)
         )
         unit = waiting[-1] if waiting else next(open_units, None)
         if unit is not None:
@@ -193,8 +193,8 @@ class Annotation:
     def unit_page(self, who: str, task: TaskName) -> str:
         """Return the page of the next unit, or one that says why there is none now."""
         unit = self.next_unit(who, task)
-        done, total = self.progress(who, task)
-        about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": done}
+        finished, total = self.progress(who, task)
+        about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": finished}
         if unit is None:
             hours = annotation_protocol().sitting_hours
             return page("annotate_done.html.j2", **about, total=total, hours=f"{hours:g}")

@@ -95,9 +95,9 @@ class LabelStore:
                 database.execute("PRAGMA synchronous=FULL")
                 yield database
         except sqlite3.DatabaseError as error:
-            why, what, is_unwritable = reason_and_remedy(error)
+            why, remedy, is_unwritable = reason_and_remedy(error)
             if is_unwritable:
-                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({why}); {what}") from error
+                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({why}); {remedy}") from error
             raise TrapsError(
                 f"{self.folder / DATABASE}: cannot be used ({why}); every confirmed label is in {LABELS_FILE}: move "
                 "the database away, and it is made again from there"
@@ -117,7 +117,9 @@ class LabelStore:
             rows = database.execute(
                 "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
             ).fetchall()
-        return [ShownUnit(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
+        return [
+            ShownUnit(task, unit, scenario, shown_at, bool(waits)) for task, unit, scenario, shown_at, waits in rows
+        ]
 
     def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:
         """Record that a unit is shown to a person now and waits for a label."""

@@ -114,7 +114,7 @@ class Listening:
         host = f"[{self.host}]" if ":" in self.host else self.host
         base = self.behind.rstrip("/") or f"http://{host}:{self.port}"
         tokens = {self.tokens: ""} if isinstance(self.tokens, str) else self.tokens
-        return {who: f"{base}/?token={quote(token)}" for token, who in tokens.items()}
+        return {person: f"{base}/?token={quote(token)}" for token, person in tokens.items()}
 
 
 def serve(app: FastAPI, listening: Listening) -> None:
@@ -124,8 +124,8 @@ def serve(app: FastAPI, listening: Listening) -> None:
     """
     import uvicorn
 
-    for who, address in listening.addresses().items():
-        print(f"{who}: open {address}" if who else f"open {address}", flush=True)
-    at = listening.host, listening.port
-    guarded = Guard(app, listening.tokens, *at, command=listening.command, behind=listening.behind)
-    uvicorn.run(guarded, host=at[0], port=at[1], access_log=False, log_level="warning")
+    for person, address in listening.addresses().items():
+        print(f"{person}: open {address}" if person else f"open {address}", flush=True)
+    endpoint = listening.host, listening.port
+    guarded = Guard(app, listening.tokens, *endpoint, command=listening.command, behind=listening.behind)
+    uvicorn.run(guarded, host=endpoint[0], port=endpoint[1], access_log=False, log_level="warning")
