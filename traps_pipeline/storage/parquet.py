@@ -71,9 +71,9 @@ def joined(parts: Sequence[StageOutput]) -> StageOutput:
 
     Rows are joined, tallies and shown numbers added up.
     """
-    first, *others = parts
-    for other in others:
-        first.tally.add(other.tally)
+    first, *later = parts
+    for later_part in later:
+        first.tally.add(later_part.tally)
     rows = [row for part in parts for row in part.content]
     figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
     return StageOutput(rows, first.tally, figures, first.beside)
