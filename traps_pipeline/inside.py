@@ -300,9 +300,11 @@ def direction(
     """
     directions: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
     if dataset not in directions or kind not in directions[dataset].vectors:
-        available = ", ".join(f"{name} ({', '.join(of.vectors)})" for name, of in directions.items())
+        available = ", ".join(
+            f"{name} ({', '.join(directions_of.vectors)})" for name, directions_of in directions.items()
+        )
         raise TrapsError(f"no {kind} direction of {dataset}; the study has {available or 'none'}")
-    of = directions[dataset]
-    if not 0 <= layer < of.n_layers or not 0 <= draw < len(of.vectors[kind]):
-        raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {of.n_layers - 1}")
-    return Direction(of.vectors[kind][draw][layer], layer, float(of.gaps[layer]))
+    directions_of = directions[dataset]
+    if not 0 <= layer < directions_of.n_layers or not 0 <= draw < len(directions_of.vectors[kind]):
+        raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {directions_of.n_layers - 1}")
+    return Direction(directions_of.vectors[kind][draw][layer], layer, float(directions_of.gaps[layer]))
