@@ -127,7 +127,7 @@ class Guard:
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
         refused = self._refusal(scope, headers)
-        if refused is None and scope["type"] == "http" and self._token_in(scope):
+        if refused is None and scope["type"] == "http" and self._has_token(scope):
             await self._enter(scope, send)
         elif refused is None and (person := self._whose(headers)) is not None:
             scope[WHO] = person
@@ -135,7 +135,7 @@ class Guard:
             refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
         if refused is not None:
             await _refuse(scope, receive, send, *refused)
-        elif not (scope["type"] == "http" and self._token_in(scope)):
+        elif not (scope["type"] == "http" and self._has_token(scope)):
             await self._app(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Scope, headers: Mapping[bytes, bytes]) -> tuple[int, str] | None:
@@ -150,7 +150,7 @@ class Guard:
             if of_origin.scheme not in ("http", "https") or of_origin.netloc != host:
                 return 403, "a page of another site asked for this"
         reads = not websocket and scope["method"] in _SAFE_METHODS
-        if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._token_in(scope)):
+        if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._has_token(scope)):
             return 403, "a page of another site asked for this"
         if websocket:
             return None
@@ -164,7 +164,7 @@ class Guard:
         kind = headers.get(b"content-type", b"").split(b";")[0].strip().lower()
         return None if kind == b"application/json" else (415, "a POST holds JSON here")
 
-    def _token_in(self, scope: Scope) -> bool:
+    def _has_token(self, scope: Scope) -> bool:
         if scope["method"] not in _SAFE_METHODS:
             return False
         return self._owner(_given_token(scope)) is not None

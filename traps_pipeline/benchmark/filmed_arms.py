@@ -95,7 +95,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
         every = [file for row in rows for file in files(row)]
         workspace.store.bring(file for file in every if file.name.endswith(_FOUND))
         existing = workspace.store.there(every)
-        return [row for row in rows if _missing(row, _clips(workspace, row, arms), existing)]
+        return [row for row in rows if _is_missing(row, _clips(workspace, row, arms), existing)]
 
     def job(row: Row) -> Job | None:
         spec, clips = spec_of(row), _clips(workspace, row, arms)
@@ -157,7 +157,7 @@ def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Pat
     return {arm: workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for arm in arms}
 
 
-def _missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
+def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
     """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():

@@ -48,7 +48,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
         return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
     spec, trajectory = _resolved_anew(workspace, scenario)
     words = dict(scenario.words)
-    if _words_still_fit(scenario):
+    if _has_valid_words(scenario):
         assert scenario.released is not None
         words = scenario.released.model_dump(mode="json", include=set(WORDS)) | words
     answer = words.pop("answer", spec.ground_truth)
@@ -114,7 +114,7 @@ def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[st
     return family.word(family.params_from(params), rng)
 
 
-def _words_still_fit(scenario: Scenario) -> bool:
+def _has_valid_words(scenario: Scenario) -> bool:
     """Return whether the released words fit the corrected parameters.
 
     They do if the family gives both the same words.

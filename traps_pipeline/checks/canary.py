@@ -140,7 +140,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
         for earlier, later in pairwise(epochs):
             both = [(epochs[earlier][item], row) for item, row in epochs[later].items() if item in epochs[earlier]]
             served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
-            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _counted(old, new)]
+            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _has_tokens(old, new)]
             changed.append(
                 {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
                 | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
@@ -149,7 +149,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
 
 
-def _counted(*rows: Mapping[str, Any]) -> bool:
+def _has_tokens(*rows: Mapping[str, Any]) -> bool:
     return all(not pd.isna(row["prompt_tokens"]) for row in rows)
 
 

@@ -28,7 +28,7 @@ from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, 
 from traps_pipeline.ledger.postgres import PATIENCE_S
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out
-from traps_pipeline.pipeline.runs import RunOutcome, Runs, broke_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, problems_of, range_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, TALLY
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
@@ -188,7 +188,7 @@ class RayRuns(Runs):
             run_ids.remove(run_id)
             name, failures = "" if run is None else run.tags.get(REQUEST_TAG, ""), self._failures.get(run_id, [])
             is_refused = run is not None and REFUSED_TAG in run.tags
-            if run is not None and name in self._requests and not is_refused and broke_off(run, failures):
+            if run is not None and name in self._requests and not is_refused and is_broken_off(run, failures):
                 requests.append(self._submit(*self._requests.pop(name)))
                 progress.current().note(f"run {run_id[:8]} broke off, and is made once more")
             else:

@@ -156,11 +156,11 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
         return ABSTENTION
     if (absent := _ABSENT.fullmatch(words)) and f" {absent[1]} " in f" {_words(question)} ":
         return Statement(None, rejects=True)
-    is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _offers(question, words)
+    is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _is_offered(question, words)
     return Statement(normalise(text)) if is_choice else None
 
 
-def _offers(question: str, words: str) -> bool:
+def _is_offered(question: str, words: str) -> bool:
     """Return whether a question offers these words as a choice.
 
     They then end exactly one part of its list.

@@ -23,7 +23,7 @@ PHRASES = ("i don't know", "i do not know", "i cannot", "i can't", "cannot", "un
 _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
-def begins_abstention(token: str) -> bool:
+def is_abstention_start(token: str) -> bool:
     """Return whether a token's text begins an abstention.
 
     It begins with a phrase of PHRASES, or the first word of one.
@@ -42,7 +42,7 @@ def abstention_tokens(model: LocalModel) -> list[int]:
     """
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
-    tokens = [token for token, text in enumerate(texts) if begins_abstention(text)]
+    tokens = [token for token, text in enumerate(texts) if is_abstention_start(text)]
     if not tokens:
         raise TrapsError(
             f"{model.checkpoint.name}: no token of its vocabulary begins an abstention ({', '.join(PHRASES)}), so its "

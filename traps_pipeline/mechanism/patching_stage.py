@@ -228,7 +228,7 @@ class Pairs:
             candidates = [(other, towards if kind == OTHER else into, "") for other in other_names]
         form = self._form(name, into)
         for candidate in candidates:
-            if candidate[:2] in self._items and _fits(form, self._form(*candidate)):
+            if candidate[:2] in self._items and _has_same_form(form, self._form(*candidate)):
                 return self._side(*candidate)
         return None
 
@@ -267,7 +267,7 @@ def _row(
     return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
 
 
-def _fits(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
+def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
     """Return whether two prompts have the same form, part by part."""
     return all(np.array_equal(target[part], source[part]) for part in ("system", "stamps", "visual"))
 
@@ -280,7 +280,7 @@ def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
     """
-    if not _fits(target.parts, other.parts):
+    if not _has_same_form(target.parts, other.parts):
         return None
     parts, visual = target.parts, target.parts["visual"]
     changed = changed_tokens(target.prompt, other.prompt, visual)

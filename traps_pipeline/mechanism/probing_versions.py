@@ -49,7 +49,7 @@ def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
 
 
-def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
+def has_states(workspace: Workspace, cell: StatesCell) -> bool:
     """Return whether a partition's extraction is complete.
 
     It was finished and all of its files still exist.
@@ -65,7 +65,7 @@ def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
     return workspace.store.sizes(files).keys() == files
 
 
-def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
+def has_directions(workspace: Workspace, extraction: Extraction) -> bool:
     """Return whether all files in the directions table of an extraction exist."""
     paths = {workspace.root / path for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
     files = paths | {path.with_suffix(".json") for path in paths}

@@ -242,7 +242,7 @@ class ApiBackend:
         """
         from traps_pipeline.models.wire import cause_of
 
-        if exchange.never_left:
+        if exchange.is_unsent:
             why = redact(plain(exchange.problem or cause_of(error)))
             self._tell(UNREACHABLE, why, passes=True)
             raise TransientError(UNREACHABLE, billed=False, why=why) from None
@@ -263,7 +263,7 @@ class ApiBackend:
         status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
-        billed = exchange.may_be_billed(status, is_explained=is_explained)
+        billed = exchange.is_billable(status, is_explained=is_explained)
         origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
         origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if reported.is_filtered and status not in TRANSIENT_STATUSES:

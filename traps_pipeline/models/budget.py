@@ -134,9 +134,9 @@ class Budget:
                     self._in_flight[reservation.id] = reservation
                     return reservation
                 await self._replace(reservation, 0.0)
-                if not self._in_flight_through(account):
+                if not self._has_calls_through(account):
                     raise BudgetReached(account.explain(worst_usd))
-            elif not await self._may_make_room(result):
+            elif not await self._has_room_later(result):
                 raise BudgetReached(reached(result.slot, result.taken_usd, self._caps[result.slot], worst_usd))
             async with self._changed:
                 with suppress(TimeoutError):
@@ -165,7 +165,7 @@ class Budget:
         settled = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
         await asyncio.wrap_future(settled)
 
-    async def _may_make_room(self, full: CapExhausted) -> bool:
+    async def _has_room_later(self, full: CapExhausted) -> bool:
         """Return whether calls in flight may cost less than their worst case.
 
         Those of any process count.
@@ -175,7 +175,7 @@ class Budget:
         assert self._money is not None, "what is full was asked for"
         return await asyncio.to_thread(self._money.is_any_alive, full.others)
 
-    def _in_flight_through(self, account: AccountBudget) -> bool:
+    def _has_calls_through(self, account: AccountBudget) -> bool:
         """Return whether this process's calls in flight may free an account's budget.
 
         Settling them may.

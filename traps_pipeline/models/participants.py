@@ -182,7 +182,7 @@ async def attempt(
         progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
-        if await _stopped_within(allowed.stop, wait):
+        if await _is_stopped_within(allowed.stop, wait):
             return _given_up("interrupted", number, seconds, lost_usd)
     raise AssertionError("unreachable: the last attempt returns")
 
@@ -225,7 +225,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
                 outcome = replace(outcome, cost_usd=cost_usd)
             return outcome
         except TimeoutError:
-            if exchange.never_left:
+            if exchange.is_unsent:
                 why = f"no connection was made within {entry.limits.timeout_s:g} s"
                 raise TransientError(UNREACHABLE, billed=False, why=why) from None
             raise TransientError("timeout") from None
@@ -233,7 +233,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise
         finally:
-            if exchange.never_left:  # also for a call that is cancelled before it is sent
+            if exchange.is_unsent:  # also for a call that is cancelled before it is sent
                 cost_usd = 0.0
             if reservation is not None and cost_usd > 0:
                 allowed.paid_by.append(reservation)
@@ -253,7 +253,7 @@ def _believed(cost_usd: float | None, worst_usd: float) -> float:
     return min(cost_usd, OVERRUN * worst_usd)
 
 
-async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
+async def _is_stopped_within(stop: asyncio.Event, seconds: float) -> bool:
     with suppress(TimeoutError):
         await asyncio.wait_for(stop.wait(), seconds)
     return stop.is_set()

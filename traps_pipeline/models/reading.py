@@ -91,12 +91,12 @@ def read_answer(
         return Reading("degenerate", None, reasoning, is_json, why)
     if why := degenerate(text):
         return Reading("degenerate", None, reasoning, is_json, why)
-    if is_cut_off and not _states_its_answer(text):
+    if is_cut_off and not _has_final_answer(text):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)
 
 
-def _states_its_answer(text: str) -> bool:
+def _has_final_answer(text: str) -> bool:
     """Return whether a truncated text contains a final answer.
 
     That is the complete field of its object, or an answer announced before the object. The object's reason announces

@@ -182,7 +182,7 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
         cells = [cell for cell in protocol.cells(model) if cell.key in cell_keys]
         if not cells:
             continue
-        if workspace is None or lineage is None or not _judged(lineage, cells):
+        if workspace is None or lineage is None or not _is_judged(lineage, cells):
             labels.add(protocol.n, 0)
             continue
         samples = sample_failures(workspace, judge, model).values()
@@ -191,7 +191,7 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
     return labels
 
 
-def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
+def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
     """Return whether current verdicts exist of all cells whose dataset has items."""
     with_items = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
     return bool(with_items) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in with_items)
@@ -203,7 +203,7 @@ def _count_calls(
     plan = {model: (Count(), Count()) for model in experiment.models}
     panel, lineage = load_panel(study.panel), Lineage(workspace) if workspace else None
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
-    current = {dataset for dataset in experiment.datasets if lineage and _items_current(lineage, dataset)}
+    current = {dataset for dataset in experiment.datasets if lineage and _has_current_items(lineage, dataset)}
     items = {
         dataset: _items(workspace, lineage, dataset, scenes[dataset], is_current=dataset in current)
         for dataset in experiment.datasets
@@ -287,7 +287,7 @@ def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell:
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
 
 
-def _items_current(lineage: Lineage, dataset: str) -> bool:
+def _has_current_items(lineage: Lineage, dataset: str) -> bool:
     """Return whether a dataset's items and everything upstream are current."""
     return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
 

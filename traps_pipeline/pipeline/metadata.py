@@ -77,7 +77,7 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
     shown = [row for rows in samples.values() for row in rows]
-    telling = [c.name for c in table.columns if _tells(c.type, [row.get(c.name) for row in shown])]
+    telling = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in shown])]
     names = [*table.key, *([ranked] if ranked else []), *telling]
     names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {
@@ -87,7 +87,7 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
     return {title: dg.MetadataValue.table(records) for title, records in tables.items() if records}
 
 
-def _tells(kind: Any, values: Sequence[Any]) -> bool:
+def _is_telling(kind: Any, values: Sequence[Any]) -> bool:
     """Return whether a column is worth a preview.
 
     Its values are numbers or short texts, and not all alike.

@@ -64,7 +64,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         with instance:
             for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
                 here = run.tags.get(HOST_TAG) == this_host()
-                if here and PID_TAG in run.tags and not _alive(int(run.tags[PID_TAG])):
+                if here and PID_TAG in run.tags and not _is_alive(int(run.tags[PID_TAG])):
                     instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
             yield instance
     except BrokenPipeError:
@@ -122,7 +122,7 @@ def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
     return dg.DagsterInstance.local_temp(str(home), overrides={"compute_logs": silent})
 
 
-def _alive(pid: int) -> bool:
+def _is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

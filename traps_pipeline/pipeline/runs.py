@@ -147,7 +147,7 @@ def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
     return RunOutcome(problems, over)
 
 
-def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
+def is_broken_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
     """Return whether a run or step ended without stating a reason.
 
     Host, network or database failed.

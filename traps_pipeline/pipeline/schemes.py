@@ -21,7 +21,7 @@ _HERE = StudyPartitions(study_here())
 
 # Groups of assets that the study does not use: Dagster does not show them, and nothing materializes them.
 LEFT_OUT = frozenset(
-    group for group, used in (("mechanism", _HERE.looks_inside), ("arms", bool(_HERE.arms))) if not used
+    group for group, used in (("mechanism", _HERE.has_mechanism), ("arms", bool(_HERE.arms))) if not used
 )
 
 CATEGORY = Partitioning({"category": _HERE.categories}, lambda key: {"category": key}, lambda study: study.categories)

@@ -71,7 +71,7 @@ class StudyPartitions:
         return [dataset for dataset in self.datasets if dataset in BESIDE]
 
     @cached_property
-    def asks_pairs(self) -> bool:
+    def has_pairs(self) -> bool:
         """Whether any of `datasets` consists of pairs: arms alone have no leaderboard."""
         return bool({*self.datasets} & {*DATASETS})
 
@@ -115,7 +115,7 @@ class StudyPartitions:
         return (datasets, settings) if experiments and settings else None
 
     @cached_property
-    def looks_inside(self) -> bool:
+    def has_mechanism(self) -> bool:
         """Whether any mechanistic analysis is requested."""
         return self._inside is not None
 
@@ -135,7 +135,7 @@ class StudyPartitions:
         return settings.patching.prompt if settings.patching else None
 
     @cached_property
-    def reads_sentences(self) -> bool:
+    def has_sentences(self) -> bool:
         """Whether log-probabilities of abstentions are computed."""
         return self._inside is not None and (self._inside[1] is None or bool(self._inside[1].sentences))
 

@@ -305,11 +305,11 @@ def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -
             continue
         for column in table.columns:
             stated_value, own_value = stated_rows[entry][column.name], own_rows[entry][column.name]
-            if not _equal(stated_value, own_value):
+            if not _is_equal(stated_value, own_value):
                 yield f"{name}: {column.name} is {stated_value!r:.40}, the votes give {own_value!r:.40}"
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _is_equal(one: Any, other: Any) -> bool:
     if isinstance(one, float) and isinstance(other, float):
         return math.isclose(one, other, rel_tol=CLOSE, abs_tol=CLOSE)
     return one == other

@@ -111,7 +111,7 @@ def claims() -> Iterator[AuditFinding]:
     """
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
-        is_same = _same_words(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
+        is_same = _is_same_wording(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
         verdict: Verdict = AGREES if is_same else DIFFERS
         reason = recomputed.reason if verdict == DIFFERS else ""
         if verdict == DIFFERS and recomputed.agrees is None:
@@ -120,7 +120,7 @@ def claims() -> Iterator[AuditFinding]:
         yield AuditFinding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
 
 
-def _same_words(printed: str, recomputed: str) -> bool:
+def _is_same_wording(printed: str, recomputed: str) -> bool:
     """Return whether two texts agree at the printed digits and name the same things."""
     own_numbers, printed_numbers = _numbers(recomputed), _numbers(printed)
     if len(own_numbers) != len(printed_numbers):

@@ -176,7 +176,7 @@ class MediaStore:
             with _alone(note.parent):
                 self._bring(note, spec)
                 media = self._here(clip_digest, spec)
-                if media is None or not _whole(media):
+                if media is None or not _is_complete(media):
                     media = _make(clip, clip_digest, spec, note)
                 self._store.keep([note] if media.path is None else [media.path, note])
                 self._sound[note] = media
@@ -250,7 +250,7 @@ def _damaged(path: Path, why: str) -> DamagedClip:
     return DamagedClip(f"{path}: is not what was prepared ({why}); delete it and run again: it is prepared anew")
 
 
-def _whole(media: Media) -> bool:
+def _is_complete(media: Media) -> bool:
     try:
         return media.path is None or bool(payload(media))
     except DamagedClip:

@@ -131,7 +131,7 @@ def require_no_code(checkpoint: Checkpoint) -> None:
     """
     code = [path.relative_to(checkpoint.folder).as_posix() for path in sorted(checkpoint.folder.rglob("*.py"))]
     for path in sorted(checkpoint.folder.glob("*.json")):
-        if path.stat().st_size <= _CONFIG_BYTES and _names_code(path):
+        if path.stat().st_size <= _CONFIG_BYTES and _has_own_code(path):
             code.append(f"auto_map in {path.name}")
     if code:
         more = f" and {len(code) - 1} more" if len(code) > 1 else ""
@@ -141,7 +141,7 @@ def require_no_code(checkpoint: Checkpoint) -> None:
         )
 
 
-def _names_code(path: Path) -> bool:
+def _has_own_code(path: Path) -> bool:
     """Return whether settings name classes of a checkpoint's own files.
 
     JSON may spell the name in any way.

@@ -92,7 +92,7 @@ def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
 
 
-def _gated(partitions: StudyPartitions, key: str) -> bool:
+def _is_gated(partitions: StudyPartitions, key: str) -> bool:
     """Return whether the model of an extraction is also evaluated.
 
     Otherwise a gate has no answers to change.
@@ -106,7 +106,7 @@ _gates = partial(
     _stage,
     code="2",
     parents=[_STATES, of(probe_items, EVERY), of(probes, SAME), of(verdicts, _GATED, need="some"), probing_settings],
-    wants=_gated,
+    wants=_is_gated,
 )
 
 
@@ -149,7 +149,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     tables.ITEM_SCORES,
     parents=[_STATES, of(probes, SAME), of(verdicts, _GATED, need="none"), probing_settings],
-    wants=_gated,
+    wants=_is_gated,
 )
 def item_scores(workspace: Workspace, key: str) -> StageOutput:
     """Return each item's scores from states and from output, with verdicts.
@@ -161,16 +161,16 @@ def item_scores(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
 
 
-def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
+def _has_sentences(partitions: StudyPartitions, key: str) -> bool:
     extraction = Extraction.parse(key)
     evaluations = {(e.model, e.regime) for e in partitions.evaluations}
-    return partitions.reads_sentences and (extraction.model, extraction.prompt) in evaluations
+    return partitions.has_sentences and (extraction.model, extraction.prompt) in evaluations
 
 
 @_stage(
     tables.SENTENCES,
     parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
-    wants=_read_in_sentences,
+    wants=_has_sentences,
 )
 def sentences(workspace: Workspace, key: str) -> StageOutput:
     """Return a model's likelihood of whole abstentions after every item.

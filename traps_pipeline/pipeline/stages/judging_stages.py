@@ -15,7 +15,7 @@ from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
-from traps_pipeline.pipeline.stages.scoring_stages import asks_pairs, leaderboard
+from traps_pipeline.pipeline.stages.scoring_stages import has_pairs, leaderboard
 from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.benchmark_tables import current_rows
@@ -66,7 +66,7 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
 _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 
-@_stage(AGREEMENT, parents=_VOTED, wants=asks_pairs)
+@_stage(AGREEMENT, parents=_VOTED, wants=has_pairs)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return agreement of the panel and any two judges by dataset and task.
 
@@ -77,7 +77,7 @@ def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))
 
 
-@_stage(JUDGE_BIAS, parents=_VOTED, wants=asks_pairs)
+@_stage(JUDGE_BIAS, parents=_VOTED, wants=has_pairs)
 def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return each judge's rate of yes against the majority, by dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias as rows_of
@@ -85,7 +85,7 @@ def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
 
 
-@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=asks_pairs)
+@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=has_pairs)
 def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return PECS by the votes of two judges, for each judge left out."""
     from traps_pipeline.scoring.leave_one_out import leave_one_out as rows_of

@@ -118,7 +118,7 @@ def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) 
 
 
 def _lost_states(workspace: Workspace, key: str) -> list[str]:
-    return [] if versions.states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"]
+    return [] if versions.has_states(workspace, StatesCell.parse(key)) else ["its states are gone"]
 
 
 @_stage(
@@ -171,7 +171,7 @@ def probes(workspace: Workspace, key: str) -> StageOutput:
 
 
 def _lost_directions(workspace: Workspace, key: str) -> list[str]:
-    return [] if versions.directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
+    return [] if versions.has_directions(workspace, Extraction.parse(key)) else ["its directions are gone"]
 
 
 @_stage(

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 _stage = partial(stage, group="scoring")
 
 
-def asks_pairs(partitions: StudyPartitions, key: str | None) -> bool:
+def has_pairs(partitions: StudyPartitions, key: str | None) -> bool:
     """Return whether the study evaluates pairs."""
-    return partitions.asks_pairs
+    return partitions.has_pairs
 
 
 def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
@@ -95,7 +95,7 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
 _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 
 
-@_stage(CONTRASTS, parents=_SCORED, wants=asks_pairs)
+@_stage(CONTRASTS, parents=_SCORED, wants=has_pairs)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
     """Return paired differences between models and between regimes.
 
@@ -112,7 +112,7 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
     return StageOutput(table, shown=figures)
 
 
-@_stage(REGIME_TESTS, parents=_SCORED, wants=asks_pairs)
+@_stage(REGIME_TESTS, parents=_SCORED, wants=has_pairs)
 def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return McNemar's exact test of any two regimes on the same items.
 
@@ -133,7 +133,7 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
             _none_of("standings.wrong_intervals", "intervals"),
         )
     ],
-    wants=asks_pairs,
+    wants=has_pairs,
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     """Return every model under every regime, per dataset and overall.
@@ -159,7 +159,7 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
             "robust_rows_hold", "Figures lie in [0, 1] and in their intervals.", _none_of("robust.wrong_rows", "rows")
         )
     ],
-    wants=asks_pairs,
+    wants=has_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return conjunction, robust figure and inference of each model and regime.
